@@ -1,0 +1,13 @@
+"""The errors a user may meet: one sentence that says what, where and what to do."""
+
+
+class FreeGeoError(Exception):
+    """The work failed for a reason we understand (exit code 1)."""
+
+
+class UserError(FreeGeoError, ValueError):
+    """The request cannot be carried out as asked; the sentence says what to change (exit code 2)."""
+
+
+class FreeGeoWarning(UserWarning):
+    """Something in the request was set aside or changed; the result is still what the sentence says."""
