@@ -1,0 +1,1 @@
+"""Pure, batched tensor functions for cameras, rotations, similarity transforms, depth maps and image resizing."""

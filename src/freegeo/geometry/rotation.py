@@ -1,0 +1,120 @@
+"""Rotations: quaternions, matrices, axis-angle vectors.
+
+The order of a quaternion's numbers is part of every name: ``quat_xyzw`` (scalar last; the DA3 and VGGT heads) or
+``quat_wxyz`` (scalar first; COLMAP). ``q`` and ``-q`` are the same rotation. Axis-angle vectors are in radians.
+"""
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "matrix_to_quat_xyzw",
+    "quat_wxyz_to_xyzw",
+    "quat_xyzw_to_matrix",
+    "quat_xyzw_to_wxyz",
+    "rotate",
+    "rotation_angle",
+    "so3_exp",
+    "so3_log",
+]
+
+SMALLEST_DIVISOR = 0.1  # the models' published rule; never reached by a true rotation, whose largest entry is >= 1
+SMALL_ANGLE = 1e-4  # below this, series to second order are exact to float64 rounding of the leading term
+
+
+def quat_wxyz_to_xyzw(quat_wxyz: Tensor) -> Tensor:
+    """Scalar-first quaternions (..., 4) as scalar-last ones."""
+    return quat_wxyz.roll(-1, dims=-1)
+
+
+def quat_xyzw_to_wxyz(quat_xyzw: Tensor) -> Tensor:
+    """Scalar-last quaternions (..., 4) as scalar-first ones."""
+    return quat_xyzw.roll(1, dims=-1)
+
+
+def quat_xyzw_to_matrix(quat_xyzw: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4), which need not have unit length.
+
+    The length is divided out (``specs/da3.md`` section 7, ``specs/vggt.md`` section 11). The zero quaternion is no
+    rotation and gives NaN.
+    """
+    x, y, z, w = quat_xyzw.unbind(-1)
+    n = 2.0 / quat_xyzw.square().sum(-1)
+    entries = (
+        *(1 - n * (y * y + z * z), n * (x * y - z * w), n * (x * z + y * w)),
+        *(n * (x * y + z * w), 1 - n * (x * x + z * z), n * (y * z - x * w)),
+        *(n * (x * z - y * w), n * (y * z + x * w), 1 - n * (x * x + y * y)),
+    )
+    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+
+
+def matrix_to_quat_xyzw(matrix: Tensor) -> Tensor:
+    """Quaternions (..., 4), scalar last and ``w >= 0``, of rotation matrices (..., 3, 3).
+
+    Of the four magnitudes of w, x, y, z the largest (first on ties) is taken and the others follow from it, which is
+    accurate for every rotation, half turns included (``specs/da3.md`` section 8.2). The result is not renormalised: a
+    matrix that is not quite a rotation gives a quaternion that is not quite of unit length.
+    """
+    (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = (row.unbind(-1) for row in matrix.unbind(-2))
+    squares = torch.stack((m00 + m11 + m22, m00 - m11 - m22, m11 - m00 - m22, m22 - m00 - m11), dim=-1) + 1
+    squares = squares.clamp(min=0)
+    square_w, square_x, square_y, square_z = squares.unbind(-1)
+    candidates_wxyz = (
+        *(square_w, m21 - m12, m02 - m20, m10 - m01),
+        *(m21 - m12, square_x, m10 + m01, m02 + m20),
+        *(m02 - m20, m10 + m01, square_y, m12 + m21),
+        *(m10 - m01, m20 + m02, m21 + m12, square_z),
+    )
+    candidates = torch.stack(candidates_wxyz, dim=-1).unflatten(-1, (4, 4))
+    largest_square, choice = squares.max(dim=-1, keepdim=True)
+    quat_wxyz = candidates.gather(-2, choice[..., None].expand(*choice.shape, 4)).squeeze(-2)
+    quat_wxyz = quat_wxyz / (2 * largest_square.sqrt().clamp(min=SMALLEST_DIVISOR))
+    quat_wxyz = torch.where(quat_wxyz[..., :1] < 0, -quat_wxyz, quat_wxyz)
+    return quat_wxyz_to_xyzw(quat_wxyz)
+
+
+def so3_exp(axis_angle: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) of axis-angle vectors (..., 3) in radians; differentiable at zero."""
+    squared_angle = axis_angle.square().sum(-1, keepdim=True)
+    is_small = squared_angle < SMALL_ANGLE**2
+    half_angle = torch.where(is_small, 1.0, squared_angle).sqrt() / 2
+    sine_over_angle = torch.where(is_small, 0.5 - squared_angle / 48, half_angle.sin() / (2 * half_angle))
+    cosine = torch.where(is_small, 1 - squared_angle / 8, half_angle.cos())
+    return quat_xyzw_to_matrix(torch.cat((axis_angle * sine_over_angle, cosine), dim=-1))
+
+
+def so3_log(matrix: Tensor) -> Tensor:
+    """Axis-angle vectors (..., 3), length 0..pi, of rotation matrices (..., 3, 3); differentiable at the identity."""
+    quat = matrix_to_quat_xyzw(matrix)
+    vector, scalar = quat[..., :3], quat[..., 3:]
+    squared_sine = vector.square().sum(-1, keepdim=True)
+    is_small = squared_sine < SMALL_ANGLE**2
+    sine = torch.where(is_small, 1.0, squared_sine).sqrt()
+    safe_scalar = torch.where(is_small, scalar, 1.0)  # close to 1 there; elsewhere it may be 0
+    series = 2 / safe_scalar - 2 * squared_sine / (3 * safe_scalar**3)
+    return vector * torch.where(is_small, series, 2 * torch.atan2(sine, scalar) / sine)
+
+
+def rotation_angle(matrix_a: Tensor, matrix_b: Tensor) -> Tensor:
+    """Angle (...), radians 0..pi, of the rotation between two rotation matrices (..., 3, 3).
+
+    Sine and cosine are both used, so tiny angles and half turns keep their digits (an arc cosine would lose half).
+    """
+    relative = matrix_a.mT @ matrix_b
+    skew = relative - relative.mT
+    twice_sine = torch.stack((skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]), dim=-1)
+    twice_cosine = relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1
+    return torch.atan2(torch.linalg.vector_norm(twice_sine, dim=-1), twice_cosine)
+
+
+def rotate(matrix: Tensor, vectors: Tensor) -> Tensor:
+    """Multiply vectors (..., *any, 3) by matrices (..., 3, 3), one matrix for all the ``any`` dimensions.
+
+    The leading dimensions of ``matrix`` are the *first* dimensions of ``vectors``: one camera per view turns a whole
+    (S, H, W, 3) map, and a single (3, 3) matrix turns anything.
+    """
+    leading = matrix.ndim - 2
+    flat = vectors.reshape(*vectors.shape[:leading], -1, 3)
+    return (flat @ matrix.mT).reshape(
+        *torch.broadcast_shapes(vectors.shape[:leading], matrix.shape[:-2]), *vectors.shape[leading:]
+    )

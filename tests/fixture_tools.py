@@ -1,0 +1,21 @@
+"""Where the recorded numbers are, and how closeness to them is measured."""
+
+import os
+from pathlib import Path
+
+import torch
+
+FIXTURES = Path(os.environ.get("FREEGEO_FIXTURES") or Path(__file__).parent / "fixtures")
+
+
+def fixture_path(*parts: str) -> Path:
+    return FIXTURES.joinpath(*parts)
+
+
+def relative_error(actual, expected) -> float:
+    """max|actual - expected| / max|expected|; infinite when shapes differ or NaNs are not in the same places."""
+    actual, expected = (torch.as_tensor(values).detach().cpu().double() for values in (actual, expected))
+    if actual.shape != expected.shape or not torch.equal(actual.isnan(), expected.isnan()):
+        return float("inf")
+    difference = (actual - expected).nan_to_num(nan=0.0).abs().max()
+    return float(difference / expected.nan_to_num(nan=0.0).abs().max().clamp(min=1e-300))
