@@ -1,0 +1,1 @@
+"""Models: one contract (`api`), one catalog, one file per architecture."""

@@ -1,0 +1,125 @@
+"""The contract of a reconstruction model: embed, aggregate, decode (docs/architecture.md).
+
+`embed` sees one image at a time and is never adapted; `aggregate` mixes the views and is the only place where an
+adapter lives; `decode` turns the features of any selection of views into depth and cameras.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from torch import Tensor, nn
+
+from freegeo.errors import UserError
+from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
+
+if TYPE_CHECKING:
+    from freegeo.data.photos import Photo
+
+Want = Literal["depth", "cameras", "rays", "points"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptationDefaults:
+    """What the method needs to know of one model: the published or measured settings that depend on its features."""
+
+    temperature: float
+    """Softmax temperature of the relational loss; about .6 to .8 of the features' rms."""
+    scene_lr: float
+    """Peak learning rate of the recipe `scene`."""
+    rank: int = 32
+    published: Literal["da3", "vggt"] | None = None
+    """Which of the two published families of settings a dataset recipe takes; None: the paper's DA3 column."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSpec:
+    """What others need to know of a model without looking inside."""
+
+    name: str
+    patch_size: int
+    default_side: int
+    """Longest image side after `preprocess`, in pixels."""
+    loss_layers: tuple[int, ...]
+    """Layers whose features the losses compare, ascending; the last one carries the relational loss."""
+    reference: str
+    """Reference-view rule of the frozen model."""
+    special_tokens: int
+    weights_licence: str
+    adaptation: AdaptationDefaults
+
+
+class ReconstructionModel(nn.Module, ABC):
+    """A feed-forward multi-view reconstruction model in three stages."""
+
+    spec: ModelSpec
+
+    @abstractmethod
+    def preprocess(self, photos: Sequence[Photo]) -> ImageBatch:
+        """Resize and crop photos as the model was trained; UserError when a photo cannot be used."""
+
+    @abstractmethod
+    def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:
+        """Run everything below the first cross-view layer on images (B, S, 3, H, W) in [0, 1].
+
+        `layers` names the layers that will be asked of `aggregate`; None means all that the decoder reads.
+        """
+
+    @abstractmethod
+    def aggregate(
+        self,
+        tokens: ViewTokens,
+        *,
+        layers: Collection[int] | None = None,
+        reference: str = "first",
+        cameras: Cameras | None = None,
+    ) -> Features:
+        """Mix the views; `layers` limits the result to some of the decoder's layers, nothing above them is computed."""
+
+    @abstractmethod
+    def decode(self, features: Features, *, want: Collection[Want] = ("depth", "cameras")) -> Prediction:
+        """Read depth and cameras off the features of the views given; everything has leading dimensions (B, S)."""
+
+    @abstractmethod
+    def adapter_targets(self) -> list[str]:
+        """Return the exact names of the linear layers an adapter may sit on."""
+
+    @property
+    @abstractmethod
+    def camera_token_name(self) -> str | None:
+        """Name of the parameter that marks reference and other views; None when the model has none."""
+
+    def set_recompute(self, recompute: bool) -> None:
+        """Turn per-block activation checkpointing of `aggregate` on or off; a model without it keeps everything."""
+
+    def adaptable(self) -> ReconstructionModel:
+        """Return the part that an adapter belongs to; UserError for a model without cross-view layers."""
+        return self
+
+
+def check_layers(layers: Collection[int], depth: int, model: str) -> None:
+    """Raise UserError when a layer is asked for that a model of `depth` layers does not have."""
+    unknown = sorted(set(layers) - set(range(depth)))
+    if unknown or not layers:
+        raise UserError(f"{model} has layers 0 to {depth - 1}; asked for {unknown or 'none'}. Choose among them.")
+
+
+def check_want(want: Collection[str], offered: Collection[Want], model: str) -> None:
+    """Raise UserError when something is asked of `decode` that a model does not predict."""
+    unknown = sorted(set(want) - set(offered))
+    if unknown:
+        raise UserError(f"{model} does not predict {', '.join(unknown)}. Choose among {', '.join(sorted(offered))}.")
+
+
+def level_tokens(features: Features, layers: Collection[int], model: str) -> list[tuple[Tensor, Tensor]]:
+    """Return the features of the layers a head reads; UserError when `aggregate` was told to leave one out."""
+    missing = [layer for layer in layers if layer not in features.levels]
+    if missing:
+        raise UserError(
+            f"{model} decodes from layers {sorted(layers)}, and the features lack {missing}. "
+            "Call aggregate without `layers`, or with all of them."
+        )
+    return [features.levels[layer] for layer in layers]

@@ -1,0 +1,157 @@
+"""Every model by name: how it is built, where its weights come from, and under which licence."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from freegeo.errors import FreeGeoError, UserError
+
+if TYPE_CHECKING:
+    from freegeo.models.api import ReconstructionModel
+    from freegeo.models.checkpoints import KeyRules
+
+logger = logging.getLogger(__name__)
+
+DEFAULT_MODEL = "da3-base"
+EMBEDDED_MODEL = "freegeo-tiny"
+PLUGIN_GROUP = "freegeo.models"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelEntry:
+    """One line of the catalog; a plug-in's entry point names one of these."""
+
+    name: str
+    about: str
+    licence: str
+    """Licence of the weights."""
+    parameters: int
+    build: Callable[[], ReconstructionModel] | None = None
+    """Builds the model without weights; None: known, but not implemented."""
+    keys: Callable[[], KeyRules] | None = None
+    """Rules that translate the checkpoint's names; None: the names are the model's own."""
+    hub_id: str | None = None
+    hub_file: str = "model.safetensors"
+    gated: bool = False
+    """The hub hands the file out only to accounts that accepted its licence."""
+    packaged_weights: Path | None = None
+    """Weights that come with an installed package."""
+
+    @property
+    def download_gb(self) -> float:
+        """Size of the float32 checkpoint."""
+        return self.parameters * 4 / 1e9
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadedFrom:
+    """Where a model's weights came from; stored with everything made from them."""
+
+    model: str
+    file: str
+    fingerprint: str
+    licence: str
+
+
+def names() -> list[str]:
+    """Return all model names: our own, then those of installed plug-ins."""
+    return list(_own_entries()) + sorted(_plugin_points())
+
+
+def entry(name: str) -> ModelEntry:
+    """Look a model up; UserError lists the names that exist."""
+    own = _own_entries()
+    if name in own:
+        return own[name]
+    points = _plugin_points()
+    if name in points:
+        return points[name].load()
+    raise UserError(f"unknown model '{name}'. Known are {', '.join(names())}.")
+
+
+def build_empty(name: str) -> ReconstructionModel:
+    """Build a model on the meta device: shapes and counts, no memory."""
+    from freegeo.models.checkpoints import build_on_meta
+
+    return build_on_meta(_buildable(name))  # type: ignore[return-value]
+
+
+def load_model(name: str = DEFAULT_MODEL, *, checkpoint: str | Path | None = None) -> ReconstructionModel:
+    """Load a frozen model on the CPU, from a local file or folder, the package, or the model hub.
+
+    The weights' licence is logged and stored in `model.loaded_from`. UserError when the name is unknown, the file
+    does not fit, or the download is not possible.
+    """
+    from freegeo.models import checkpoints
+
+    item = entry(name)
+    build = _buildable(name)
+    path = checkpoints.find_file(Path(checkpoint)) if checkpoint else _packaged_or_downloaded(item)
+    rules = item.keys() if item.keys else checkpoints.KeyRules()
+    model: ReconstructionModel = checkpoints.build_on_meta(build)  # type: ignore[assignment]
+    checkpoints.load_weights(model, path, rules, name)
+    model.eval()
+    model.loaded_from = LoadedFrom(
+        model=name, file=path.name, fingerprint=checkpoints.fingerprint(path), licence=item.licence
+    )
+    logger.info("%s loaded from %s; licence of the weights: %s", name, path, item.licence)
+    return model
+
+
+def download(name: str) -> Path:
+    """Fetch a model's checkpoint from the hub (resumable) and return its path."""
+    item = entry(name)
+    if item.packaged_weights is not None:
+        return item.packaged_weights
+    if item.hub_id is None:
+        raise UserError(f"{name} has no download; give its weights with --checkpoint.")
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError
+
+    try:
+        return Path(hf_hub_download(item.hub_id, item.hub_file))
+    except (LocalEntryNotFoundError, HfHubHTTPError, OSError) as error:
+        logger.debug("download of %s failed: %s", item.hub_id, error)
+        raise UserError(
+            f"the checkpoint of {name} ({item.hub_id}, {item.download_gb:.1f} GB) is not on this machine and could not "
+            f"be downloaded. {_how_to_download(item)}, pass --checkpoint FILE, or use the embedded model: "
+            f"--model {EMBEDDED_MODEL}."
+        ) from None
+
+
+def _how_to_download(item: ModelEntry) -> str:
+    command = f"`freegeo models download {item.name}`"
+    if not item.gated:
+        return f"Go online and run {command}"
+    return f"Accept its licence at https://huggingface.co/{item.hub_id}, log in with `hf auth login` and run {command}"
+
+
+def _packaged_or_downloaded(item: ModelEntry) -> Path:
+    if item.packaged_weights is None:
+        return download(item.name)
+    if not item.packaged_weights.is_file():
+        raise FreeGeoError(f"{item.packaged_weights}: the weights of {item.name} are missing. Reinstall the package.")
+    return item.packaged_weights
+
+
+def _buildable(name: str) -> Callable[[], ReconstructionModel]:
+    item = entry(name)
+    if item.build is None:
+        raise UserError(f"{name} is listed but not implemented yet: {item.about}")
+    return item.build
+
+
+def _own_entries() -> dict[str, ModelEntry]:
+    from freegeo.models import da3_presets, vggt_presets
+
+    return {item.name: item for item in (*da3_presets.ENTRIES, *vggt_presets.ENTRIES)}
+
+
+def _plugin_points() -> dict:
+    from importlib.metadata import entry_points
+
+    return {point.name: point for point in entry_points(group=PLUGIN_GROUP)}

@@ -1,0 +1,164 @@
+"""Reading checkpoints: find the tensors, translate their names, and refuse anything that does not fit exactly."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from freegeo.errors import UserError
+
+_BLOCK_BYTES = 1 << 16
+_BLOCKS = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeyRules:
+    """How the names in a checkpoint file become the names of a model's state dict."""
+
+    prefix: str = ""
+    """Removed from every name; a file without it is accepted too."""
+    skipped: tuple[str, ...] = ()
+    """Prefixes (after removal) of parts that are not built."""
+    aliases: Mapping[str, str] = field(default_factory=dict)
+    """Names of a shared tensor that a file may leave out -> the name it is stored under."""
+
+    def translate(self, names: Sequence[str]) -> dict[str, str]:
+        """Return our name -> file name, for the names that are not skipped."""
+        has_prefix = bool(self.prefix) and any(name.startswith(self.prefix) for name in names)
+        ours = {(name.removeprefix(self.prefix) if has_prefix else name): name for name in names}
+        return {our: name for our, name in ours.items() if not our.startswith(self.skipped or ("\0",))}
+
+
+def find_file(path: Path) -> Path:
+    """Return the weight file a path stands for: itself, or the one weight file in a folder."""
+    if path.is_file():
+        return path
+    if not path.exists():
+        raise UserError(f"{path}: no such checkpoint. Give a .safetensors or .pt file, or a folder that holds one.")
+    for name in ("model.safetensors", "model.pt"):
+        if (path / name).is_file():
+            return path / name
+    files = sorted(path.glob("*.safetensors")) or sorted(path.glob("*.pt"))
+    if len(files) != 1:
+        raise UserError(
+            f"{path}: expected model.safetensors or model.pt, found {len(files)} weight files. Name the file itself."
+        )
+    return files[0]
+
+
+def read_header(path: Path) -> dict[str, tuple[int, ...]]:
+    """Return name -> shape of a safetensors file without loading it (and without importing torch's readers)."""
+    try:
+        with path.open("rb") as file:
+            (length,) = struct.unpack("<Q", file.read(8))
+            if length > min(path.stat().st_size, 100 << 20):
+                raise UserError(_not_safetensors(path))
+            header = json.loads(file.read(length))
+    except (struct.error, UnicodeDecodeError, json.JSONDecodeError):
+        raise UserError(_not_safetensors(path)) from None
+    end = max((info["data_offsets"][1] for name, info in header.items() if name != "__metadata__"), default=0)
+    if path.stat().st_size != 8 + length + end:
+        raise UserError(
+            f"{path}: the file is truncated ({path.stat().st_size} of {8 + length + end} bytes). Download it again."
+        )
+    return {name: tuple(info["shape"]) for name, info in header.items() if name != "__metadata__"}
+
+
+def _not_safetensors(path: Path) -> str:
+    return f"{path}: not a safetensors file (a renamed pickle?). Use the official .safetensors download."
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """Load a .safetensors file, or a .pt file of plain tensors (nothing in it is executed)."""
+    if path.suffix == ".safetensors":
+        read_header(path)
+        from safetensors.torch import load_file
+
+        return load_file(path)
+    if path.suffix not in (".pt", ".pth", ".bin"):
+        raise UserError(f"{path}: unknown kind of checkpoint '{path.suffix}'. Use .safetensors or .pt.")
+    return _read_pickle(path)
+
+
+def _read_pickle(path: Path) -> dict[str, Tensor]:
+    import pickle
+
+    try:
+        state = torch.load(path, map_location="cpu", mmap=True, weights_only=True)
+    except pickle.UnpicklingError:
+        raise UserError(
+            f"{path}: the file holds more than plain tensors, and freegeo never runs code from a checkpoint. "
+            "Use the official .safetensors download."
+        ) from None
+    except (RuntimeError, EOFError, ValueError) as error:
+        raise UserError(f"{path}: not a readable checkpoint ({str(error).splitlines()[0]}).") from None
+    state = state.get("model", state) if isinstance(state, dict) else state
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise UserError(f"{path}: not a plain state dict of tensors. Use the official .safetensors download.")
+    return state
+
+
+def load_weights(model: nn.Module, path: Path, rules: KeyRules, model_name: str) -> None:
+    """Fill a model (built anywhere, also on `meta`) from a file; names and shapes must match exactly.
+
+    Weights take the dtype the model was built with. UserError lists how many names are missing, unexpected or of
+    another shape, and the first of each.
+    """
+    tensors = read_tensors(path)
+    source = rules.translate(list(tensors))
+    for alias, stored in rules.aliases.items():
+        if stored in source:
+            source.setdefault(alias, source[stored])
+    wanted = model.state_dict()
+    require_match(
+        {name: tuple(value.shape) for name, value in wanted.items()},
+        {name: tuple(tensors[file_name].shape) for name, file_name in source.items()},
+        f"{path}: this checkpoint does not fit {model_name}",
+    )
+    state = {name: tensors[file_name].to(wanted[name].dtype) for name, file_name in source.items()}
+    model.load_state_dict(state, assign=True)
+    for parameter in model.parameters():
+        parameter.requires_grad_(False)
+
+
+def require_match(wanted: Mapping[str, tuple[int, ...]], found: Mapping[str, tuple[int, ...]], what: str) -> None:
+    """Raise UserError when two sets of named shapes differ, with counts and the first names."""
+    missing = [name for name in wanted if name not in found]
+    unexpected = [name for name in found if name not in wanted]
+    reshaped = [name for name in wanted if name in found and wanted[name] != found[name]]
+    if not (missing or unexpected or reshaped):
+        return
+    parts = [
+        f"{len(names)} {kind} (first: {show(names[0])})"
+        for kind, names, show in (
+            ("missing", missing, str),
+            ("unexpected", unexpected, str),
+            ("of another shape", reshaped, lambda n: f"{n} is {found[n]}, expected {wanted[n]}"),
+        )
+        if names
+    ]
+    raise UserError(f"{what}: {', '.join(parts)}. Check --model and --checkpoint.")
+
+
+def fingerprint(path: Path) -> str:
+    """Identify a weight file by its size and 64 evenly spaced blocks (a full hash of 5 GB would cost seconds)."""
+    size = path.stat().st_size
+    digest = hashlib.sha256(str(size).encode())
+    with path.open("rb") as file:
+        for i in range(_BLOCKS):
+            file.seek(max(0, size - _BLOCK_BYTES) * i // (_BLOCKS - 1))
+            digest.update(file.read(_BLOCK_BYTES))
+    return digest.hexdigest()[:16]
+
+
+def build_on_meta(build: Callable[[], nn.Module]) -> nn.Module:
+    """Build a model without memory, for counting or for loading by assignment."""
+    with torch.device("meta"):
+        return build()

@@ -1,0 +1,311 @@
+"""Depth Anything 3, any-view models (spec: DA3 fact sheet, sections 1 to 8).
+
+Per-view blocks, then alternating per-view and global blocks; a dual dense head for depth and rays; a camera decoder,
+and a camera encoder for known poses. Modules carry the official key names without the prefix `model.`.
+
+Letters: B scenes, S views, N tokens of a view (1 special + P patches), D width, C feature channels (2D with the
+per-view half), H W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from freegeo.errors import UserError
+from freegeo.geometry.camera import decode_camera_to_world, encode_camera_to_world
+from freegeo.models import da3_images, reference
+from freegeo.models.api import ModelSpec, ReconstructionModel, Want, check_layers, check_want, level_tokens
+from freegeo.models.dpt import DenseHead, confidence, depth_maps, read_in_chunks
+from freegeo.models.images import normalise, patch_grid
+from freegeo.models.transformer import (
+    Block,
+    Mlp,
+    PatchEmbed,
+    block_linears,
+    first_and_others,
+    grid_rope,
+    position_table,
+    run_block,
+)
+from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
+
+SELECTION = "selection"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DA3Config:
+    """Every number of one variant."""
+
+    width: int
+    depth: int
+    heads: int
+    out_layers: tuple[int, int, int, int]
+    alt_start: int
+    """First block that comes after the views were given their camera token; odd blocks from here on are global."""
+    qknorm_start: int
+    rope_start: int
+    head_features: int
+    head_channels: tuple[int, int, int, int]
+    ffn: Literal["mlp", "swiglu"] = "mlp"
+    cat_token: bool = True
+    patch_size: int = 14
+    position_grid: int = 37
+    camera_encoder_depth: int = 4
+    camera_encoder_heads: int = 16
+
+    def __post_init__(self):
+        if self.alt_start < 2:
+            raise ValueError(f"alt_start must be at least 2, got {self.alt_start}")
+        if list(self.out_layers) != sorted(set(self.out_layers)):
+            raise ValueError(f"out_layers must ascend, got {self.out_layers}")
+
+    @property
+    def channels(self) -> int:
+        """Feature channels per token."""
+        return self.width * (2 if self.cat_token else 1)
+
+
+class Backbone(nn.Module):
+    """The vision transformer: `embed` runs blocks 0 to alt_start - 1, `aggregate` the rest."""
+
+    def __init__(self, config: DA3Config):
+        super().__init__()
+        self.config = config
+        width, tokens = config.width, config.position_grid**2 + 1
+        self.patch_embed = PatchEmbed(config.patch_size, width)
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
+        self.camera_token = nn.Parameter(torch.zeros(1, 2, width))
+        self.pos_embed = nn.Parameter(torch.zeros(1, tokens, width))
+        self.blocks = nn.ModuleList(
+            Block(width, config.heads, qk_norm=i >= config.qknorm_start, norm_eps=1e-6, ffn=config.ffn)
+            for i in range(config.depth)
+        )
+        self.norm = nn.LayerNorm(width, eps=1e-5)
+        self.recompute = False
+
+    def is_global(self, index: int) -> bool:
+        """Say whether a block attends across views."""
+        return index >= self.config.alt_start and index % 2 == 1
+
+    def embed(self, images_VXHW: Tensor, keep: Collection[int]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return tokens (V, N, D) before block alt_start and, by name, the earlier outputs that are needed."""
+        grid_hw = patch_grid(images_VXHW, self.config.patch_size)
+        patches = self.patch_embed(images_VXHW)
+        x = torch.cat([self.cls_token.expand(len(patches), -1, -1), patches], dim=1)
+        x = x + self.position_embedding(grid_hw).to(x.dtype)
+        extra = {}
+        for i in range(self.config.alt_start):
+            x = self._run(i, x, grid_hw)
+            if i in keep:
+                extra[f"layer.{i}"] = x
+            if i == self.config.alt_start - 2:
+                extra[SELECTION] = x[:, 0]
+        return x, extra
+
+    def aggregate(
+        self,
+        tokens: ViewTokens,
+        layers: Collection[int],
+        order: Tensor | None,
+        camera_tokens_BSD: Tensor | None,
+    ) -> dict[int, tuple[Tensor, Tensor]]:
+        """Return layer -> (patches (B, S, P, C), special (B, S, 1, C)) in input order.
+
+        `order` (B, S) lists the views with the reference first; None keeps the input order.
+        """
+        levels = {i: self._early_level(tokens, i) for i in layers if i < self.config.alt_start}
+        x_BSND = tokens.tokens if order is None else reference.take_views(tokens.tokens, order)
+        x_BSND = torch.cat([self._first_tokens(x_BSND, camera_tokens_BSD), x_BSND[:, :, 1:]], dim=2)
+        local_BSND = x_BSND
+        for i in range(self.config.alt_start, max(layers, default=-1) + 1):
+            joined = x_BSND.flatten(1, 2) if self.is_global(i) else x_BSND.flatten(0, 1)
+            x_BSND = self._run(i, joined, tokens.grid_hw).view_as(x_BSND)
+            local_BSND = local_BSND if self.is_global(i) else x_BSND
+            if i in layers:
+                levels[i] = self._level(local_BSND, x_BSND, order)
+        return levels
+
+    def _run(self, index: int, x_BLD: Tensor, grid_hw: tuple[int, int]) -> Tensor:
+        rope = None
+        if index >= self.config.rope_start:
+            layout = "flat" if self.is_global(index) else "grid"
+            rope = grid_rope(grid_hw, 1, self.config.width // self.config.heads, layout, x_BLD.device)
+        return run_block(self.blocks[index], x_BLD, rope, recompute=self.recompute)
+
+    def _first_tokens(self, x_BSND: Tensor, camera_tokens_BSD: Tensor | None) -> Tensor:
+        if camera_tokens_BSD is not None:
+            return camera_tokens_BSD[:, :, None]
+        return first_and_others(self.camera_token, *x_BSND.shape[:2])[:, :, None].to(x_BSND.dtype)
+
+    def _early_level(self, tokens: ViewTokens, layer: int) -> tuple[Tensor, Tensor]:
+        if f"layer.{layer}" not in tokens.extra:
+            raise UserError(f"layer {layer} was not kept by `embed`. Name it in its `layers`.")
+        return self._level(tokens.extra[f"layer.{layer}"], tokens.extra[f"layer.{layer}"], None)
+
+    def _level(self, local_BSND: Tensor, x_BSND: Tensor, order: Tensor | None) -> tuple[Tensor, Tensor]:
+        y = torch.cat([local_BSND, x_BSND], dim=-1) if self.config.cat_token else x_BSND
+        if order is not None:
+            y = reference.take_views(y, order.argsort(dim=1))
+        patches = y[:, :, 1:]
+        current = self.norm(patches[..., -self.config.width :])
+        if self.config.cat_token:
+            current = torch.cat([patches[..., : self.config.width], current], dim=-1)
+        return current, y[:, :, :1]
+
+    def position_embedding(self, grid_hw: tuple[int, int]) -> Tensor:
+        """Return the embedding (1, N, D) of a patch grid."""
+        # The tenth of a patch stays inside the sampling scale: official checkpoints were trained with it.
+        rows, columns = ((n + 0.1) / self.config.position_grid for n in grid_hw)
+        return position_table(self.pos_embed, grid_hw, scale_factor=(rows, columns))
+
+
+class CameraDecoder(nn.Module):
+    """Camera token -> translation, quaternion (xyzw), field of view (vertical, horizontal), camera to world."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.backbone = nn.Sequential(
+            nn.Linear(channels, channels), nn.ReLU(), nn.Linear(channels, channels), nn.ReLU()
+        )
+        self.fc_t = nn.Linear(channels, 3)
+        self.fc_qvec = nn.Linear(channels, 4)
+        self.fc_fov = nn.Sequential(nn.Linear(channels, 2), nn.ReLU())
+
+    def forward(self, token: Tensor) -> Tensor:
+        """Return the pose encoding (..., 9)."""
+        z = self.backbone(token)
+        return torch.cat([self.fc_t(z), self.fc_qvec(z), self.fc_fov(z)], dim=-1)
+
+
+class CameraEncoder(nn.Module):
+    """Known cameras -> the token each view starts the cross-view part with."""
+
+    def __init__(self, width: int, depth: int, heads: int):
+        super().__init__()
+        self.pose_branch = Mlp(9, width // 2, width)
+        self.token_norm = nn.LayerNorm(width, eps=1e-5)
+        self.trunk = nn.Sequential(*(Block(width, heads, norm_eps=1e-5) for _ in range(depth)))
+        self.trunk_norm = nn.LayerNorm(width, eps=1e-5)
+
+    def forward(self, encoding_BS9: Tensor) -> Tensor:
+        """Return tokens (B, S, D)."""
+        return self.trunk_norm(self.trunk(self.token_norm(self.pose_branch(encoding_BS9))))
+
+
+class DA3(ReconstructionModel):
+    """Depth Anything 3 for any number of views."""
+
+    def __init__(self, config: DA3Config, spec: ModelSpec):
+        super().__init__()
+        self.config, self.spec = config, spec
+        self.backbone = nn.ModuleDict({"pretrained": Backbone(config)})
+        self.head = DenseHead(
+            channels_in=config.channels,
+            features=config.head_features,
+            out_channels=config.head_channels,
+            outputs=2,
+            patch_size=config.patch_size,
+            ray_branch=True,
+        )
+        self.cam_enc = CameraEncoder(config.width, config.camera_encoder_depth, config.camera_encoder_heads)
+        self.cam_dec = CameraDecoder(config.channels)
+
+    @property
+    def _vit(self) -> Backbone:
+        return self.backbone["pretrained"]
+
+    @property
+    def camera_token_name(self) -> str:
+        """Name of the two learned tokens: reference view, other views."""
+        return "backbone.pretrained.camera_token"
+
+    def set_recompute(self, recompute: bool) -> None:
+        """Turn per-block activation checkpointing on or off."""
+        self._vit.recompute = recompute
+
+    def adapter_targets(self) -> list[str]:
+        """Return all linears of the blocks from alt_start on."""
+        return [
+            name
+            for i, block in enumerate(self._vit.blocks)
+            if i >= self.config.alt_start
+            for name in block_linears(f"backbone.pretrained.blocks.{i}", block)
+        ]
+
+    def preprocess(self, photos: Sequence) -> ImageBatch:
+        """Resize as the reference does: longest side, then the nearest multiple of the patch (spec section 11)."""
+        return da3_images.preprocess(photos, side=self.spec.default_side, patch=self.config.patch_size)
+
+    def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:
+        """Run the per-view blocks on images (B, S, 3, H, W) in [0, 1]."""
+        wanted = self.config.out_layers if layers is None else layers
+        batch = images.shape[:2]
+        check_layers(wanted, self.config.depth, self.spec.name)
+        tokens, extra = self._vit.embed(normalise(images).flatten(0, 1), wanted)
+        return ViewTokens(
+            tokens=tokens.unflatten(0, batch),
+            extra={name: value.unflatten(0, batch) for name, value in extra.items()},
+            image_hw=(images.shape[-2], images.shape[-1]),
+            grid_hw=patch_grid(images, self.config.patch_size),
+        )
+
+    def aggregate(
+        self,
+        tokens: ViewTokens,
+        *,
+        layers: Collection[int] | None = None,
+        reference: str = "first",
+        cameras: Cameras | None = None,
+    ) -> Features:
+        """Run the cross-view blocks; known cameras replace the learned tokens and switch reference selection off."""
+        wanted = self.config.out_layers if layers is None else layers
+        check_layers(wanted, self.config.depth, self.spec.name)
+        order = None if cameras is not None else self.view_order(tokens, reference)
+        known = None if cameras is None else self.encode_cameras(cameras, tokens.image_hw)
+        levels = self._vit.aggregate(tokens, wanted, order, known)
+        return Features(levels=levels, image_hw=tokens.image_hw, grid_hw=tokens.grid_hw)
+
+    def view_order(self, tokens: ViewTokens, rule: str) -> Tensor | None:
+        """Return the reference-first order (B, S), or None where the input order stays (fewer than 3 views)."""
+        return reference.view_order(tokens.extra[SELECTION], rule)
+
+    def encode_cameras(self, cameras: Cameras, image_hw: tuple[int, int]) -> Tensor:
+        """Return camera tokens (B, S, D) of known, already normalised cameras (`se3.normalise_poses`)."""
+        with torch.autocast(cameras.K.device.type, enabled=False):
+            return self.cam_enc(encode_camera_to_world(cameras.T_cam_world, cameras.K, image_hw))
+
+    def decode(self, features: Features, *, want: Collection[Want] = ("depth", "cameras")) -> Prediction:
+        """Read out depth, confidence, cameras and (only when asked) rays, in float32."""
+        check_want(want, ("depth", "cameras", "rays"), self.spec.name)
+        maps: dict[str, Tensor] = {}
+        with torch.autocast(next(iter(features.levels.values()))[0].device.type, enabled=False):
+            if "depth" in want or "rays" in want:
+                maps |= self._dense(features, want)
+            if "cameras" in want:
+                maps |= self._cameras(features)
+        return Prediction(**maps)
+
+    def _cameras(self, features: Features) -> dict[str, Tensor]:
+        [(_, special)] = level_tokens(features, self.config.out_layers[-1:], self.spec.name)
+        token = special[..., 0, :].float()
+        T_cam_world, K = decode_camera_to_world(self.cam_dec(token), features.image_hw)
+        return {"T_cam_world": T_cam_world, "K": K}
+
+    def _dense(self, features: Features, want: Collection[Want]) -> dict[str, Tensor]:
+        levels = [patch for patch, _ in level_tokens(features, self.config.out_layers, self.spec.name)]
+        return read_in_chunks(levels, lambda chunk: self._dense_chunk(chunk, features.grid_hw, want))
+
+    def _dense_chunk(self, levels: list[Tensor], grid_hw: tuple[int, int], want: Collection[Want]) -> dict[str, Tensor]:
+        pyramid = self.head.pyramid(levels, grid_hw)
+        maps = {}
+        if "depth" in want:
+            maps |= depth_maps(self.head.dense(pyramid, grid_hw))
+        if "rays" in want:
+            directions_origins, conf = self.head.rays(pyramid, grid_hw).split([6, 1], dim=1)
+            maps["rays"] = torch.cat([directions_origins, confidence(conf)], dim=1).permute(0, 2, 3, 1)
+        return maps

@@ -1,0 +1,45 @@
+"""Which arithmetic a model runs in: float32, or autocast to bfloat16 or float16 with float32 heads and norms."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from typing import Literal, get_args
+
+import torch
+
+from freegeo.errors import UserError
+
+Precision = Literal["fp32", "bf16", "fp16"]
+_DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
+
+
+def choose_device(name: str | None) -> torch.device:
+    """Return the device asked for, or the best one at hand; UserError when it is not there."""
+    if name is None:
+        if torch.cuda.is_available():
+            return torch.device("cuda")
+        return torch.device("mps" if torch.backends.mps.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise UserError(f"unknown device '{name}'. Choose cpu, cuda, cuda:N or mps.") from None
+    available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if not available.get(device.type, False):
+        raise UserError(f"device '{name}' is not available here. Choose --device cpu.")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise UserError(f"device '{name}' does not exist: this machine has {torch.cuda.device_count()} CUDA devices.")
+    return device
+
+
+def choose_precision(name: str | None, device: torch.device) -> Precision:
+    """Return the precision asked for, or bf16 on a CUDA device that has it, else fp32."""
+    if name is None:
+        return "bf16" if device.type == "cuda" and torch.cuda.is_bf16_supported() else "fp32"
+    if name not in get_args(Precision):
+        raise UserError(f"unknown precision '{name}'. Choose fp32, bf16 or fp16.")
+    return name  # type: ignore[return-value]
+
+
+def autocast(device: torch.device, precision: Precision) -> AbstractContextManager:
+    """Return the context that a model's embed and aggregate run in."""
+    return nullcontext() if precision == "fp32" else torch.autocast(device.type, _DTYPES[precision])

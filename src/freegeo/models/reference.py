@@ -1,0 +1,72 @@
+"""Which view the others are described in: the rules of DA3's fact sheet, section 5."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from freegeo.errors import UserError
+
+SMALLEST_SELECTION = 3
+"""With fewer views than this the first one is the reference, whatever the rule."""
+
+
+def _similarity(unit_BSD: Tensor) -> Tensor:
+    return unit_BSD @ unit_BSD.transpose(1, 2) - torch.eye(unit_BSD.shape[1], device=unit_BSD.device)
+
+
+def _min_max(metric_BS: Tensor) -> Tensor:
+    low, high = metric_BS.amin(1, keepdim=True), metric_BS.amax(1, keepdim=True)
+    return (metric_BS - low) / (high - low + 1e-8)
+
+
+def saddle_balanced(token_BSD: Tensor) -> Tensor:
+    """Return the view whose similarity, norm and spread lie closest to the middle of their ranges."""
+    norm_BS = token_BSD.norm(dim=-1)
+    unit_BSD = token_BSD / norm_BS[..., None]
+    similarity_BS = _similarity(unit_BSD).sum(-1) / (token_BSD.shape[1] - 1)
+    metrics = (similarity_BS, norm_BS, unit_BSD.var(dim=-1))
+    return sum((_min_max(m) - 0.5).abs() for m in metrics).argmin(1)
+
+
+def saddle_sim_range(token_BSD: Tensor) -> Tensor:
+    """Return the view with the widest range of similarities; ties between a most similar pair are arbitrary."""
+    similarity_BSS = _similarity(token_BSD / token_BSD.norm(dim=-1, keepdim=True))
+    return (similarity_BSS.amax(-1) - similarity_BSS.amin(-1)).argmax(1)
+
+
+def first(token_BSD: Tensor) -> Tensor:
+    """Return view 0."""
+    return torch.zeros(len(token_BSD), dtype=torch.long, device=token_BSD.device)
+
+
+def middle(token_BSD: Tensor) -> Tensor:
+    """Return view S // 2."""
+    return torch.full_like(first(token_BSD), token_BSD.shape[1] // 2)
+
+
+RULES: dict[str, Callable[[Tensor], Tensor]] = {
+    "first": first,
+    "middle": middle,
+    "saddle_balanced": saddle_balanced,
+    "saddle_sim_range": saddle_sim_range,
+}
+
+
+def view_order(token_BSD: Tensor, rule: str) -> Tensor | None:
+    """Return the views (B, S) with the chosen one first and the others in input order; None for the input order."""
+    if rule not in RULES:
+        raise UserError(f"unknown reference-view rule '{rule}': choose one of {', '.join(RULES)}.")
+    views = token_BSD.shape[1]
+    if rule == "first" or views < SMALLEST_SELECTION:
+        return None
+    chosen_B1 = RULES[rule](token_BSD.float())[:, None]
+    # A stable sort by "is not the chosen one" keeps the others in input order.
+    return (torch.arange(views, device=token_BSD.device) != chosen_B1).to(torch.uint8).argsort(dim=1, stable=True)
+
+
+def take_views(x: Tensor, order_BS: Tensor) -> Tensor:
+    """Put the views of x (B, S, ...) in the given order, for each batch entry."""
+    return x[torch.arange(len(x), device=x.device)[:, None], order_BS]

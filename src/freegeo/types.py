@@ -1,0 +1,201 @@
+"""The values that cross room borders: image batches, view tokens, features, predictions.
+
+Letters: B batch, S views, H W pixels, P patches, N tokens, T special tokens, C channels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Self
+
+import torch
+from torch import Tensor
+
+_META_KEYS = ("image_hw", "grid_hw")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageBatch:
+    """Photos at the size a model reads them, with the way back to the photos' own pixels.
+
+    A photo pixel `u` appears in the model image at `u * scale + offset` (per axis, x first); principal points
+    move by the same rule, as the benchmark protocol scales them.
+    """
+
+    images: Tensor
+    """(S, 3, H, W), RGB in [0, 1]."""
+    names: tuple[str, ...]
+    photo_hw: Tensor
+    """(S, 2) int64: height and width of each photo after EXIF rotation."""
+    scale_xy: Tensor
+    """(S, 2) float64."""
+    offset_xy: Tensor
+    """(S, 2) float64: minus the cropped pixels."""
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return len(self.names)
+
+    def select(self, views: Sequence[int]) -> Self:
+        """Return the chosen views, in the order given."""
+        index = torch.as_tensor(list(views), dtype=torch.long)
+        tensors = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "names"}
+        return replace(self, names=tuple(self.names[i] for i in views), **tensors)
+
+    def photo_K(self, K: Tensor) -> Tensor:
+        """Turn intrinsics (S, 3, 3) of the model's images into those of the original photos."""
+        return self._move_K(K, 1 / self.scale_xy.to(K), -self.offset_xy.to(K) / self.scale_xy.to(K))
+
+    def model_K(self, K: Tensor) -> Tensor:
+        """Turn intrinsics (S, 3, 3) of the original photos into those of the model's images."""
+        return self._move_K(K, self.scale_xy.to(K), self.offset_xy.to(K))
+
+    @staticmethod
+    def _move_K(K: Tensor, scale_xy: Tensor, offset_xy: Tensor) -> Tensor:
+        rows = K[:, :2] * scale_xy[:, :, None]
+        rows[:, :, 2] += offset_xy
+        return torch.cat([rows, K[:, 2:]], dim=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewTokens:
+    """What `embed` knows of each view by itself: the input of the first cross-view layer.
+
+    `tokens` is the residual stream; `extra` holds what later steps need of earlier layers, each (B, S, ...):
+    the class token that reference selection compares (`selection`) and the outputs of layers below the first
+    cross-view one (`layer.<i>`).
+    """
+
+    tokens: Tensor
+    """(B, S, N, C)."""
+    image_hw: tuple[int, int]
+    grid_hw: tuple[int, int]
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def select(self, views: Sequence[int]) -> Self:
+        """Return the chosen views, in the order given."""
+        index = torch.as_tensor(list(views), dtype=torch.long, device=self.tokens.device)
+        extra = {name: value.index_select(1, index) for name, value in self.extra.items()}
+        return replace(self, tokens=self.tokens.index_select(1, index), extra=extra)
+
+    @classmethod
+    def join_views(cls, parts: Sequence[ViewTokens]) -> ViewTokens:
+        """Put the views of several parts behind each other; all parts have the same image size."""
+        return _concatenate(parts, dim=1)
+
+    @classmethod
+    def stack(cls, samples: Sequence[ViewTokens]) -> ViewTokens:
+        """Put several samples into one batch; all have the same views and image size."""
+        return _concatenate(samples, dim=0)
+
+    def to(self, *args, **kwargs) -> Self:
+        """Move or cast all tensors, with the arguments of `Tensor.to`."""
+        extra = {name: value.to(*args, **kwargs) for name, value in self.extra.items()}
+        return replace(self, tokens=self.tokens.to(*args, **kwargs), extra=extra)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return everything as named tensors, for a cache or a file."""
+        return {"tokens": self.tokens, **_meta_tensors(self), **{f"extra.{k}": v for k, v in self.extra.items()}}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
+        """Rebuild what `tensors` returned."""
+        extra = {k.removeprefix("extra."): v for k, v in tensors.items() if k.startswith("extra.")}
+        return cls(tokens=tensors["tokens"], extra=extra, **_read_meta(tensors))
+
+
+def _concatenate(parts: Sequence[ViewTokens], dim: int) -> ViewTokens:
+    first = parts[0]
+    if any(p.image_hw != first.image_hw for p in parts):
+        raise ValueError(f"view tokens of different image sizes cannot be joined: {[p.image_hw for p in parts]}")
+    extra = {name: torch.cat([p.extra[name] for p in parts], dim) for name in first.extra}
+    return replace(first, tokens=torch.cat([p.tokens for p in parts], dim), extra=extra)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Features:
+    """What the decoder reads: per layer the patch tokens and the special tokens of every view, in input order."""
+
+    levels: Mapping[int, tuple[Tensor, Tensor]]
+    """layer -> (patch (B, S, P, C), special (B, S, T, C)); special[..., 0, :] is the camera token."""
+    image_hw: tuple[int, int]
+    grid_hw: tuple[int, int]
+
+    def select(self, views: Sequence[int]) -> Self:
+        """Return the chosen views, in the order given ("8->4" is `select([0, 2, 4, 6])`)."""
+        return self._map(
+            lambda t: t.index_select(1, torch.as_tensor(list(views), dtype=torch.long, device=t.device))
+        )
+
+    @classmethod
+    def stack(cls, samples: Sequence[Features]) -> Features:
+        """Put several samples into one batch."""
+        levels = {
+            layer: tuple(torch.cat([s.levels[layer][k] for s in samples]) for k in (0, 1))
+            for layer in samples[0].levels
+        }
+        return replace(samples[0], levels=levels)
+
+    def to(self, *args, **kwargs) -> Self:
+        """Move or cast all tensors, with the arguments of `Tensor.to`."""
+        return self._map(lambda t: t.to(*args, **kwargs))
+
+    def _map(self, change) -> Self:
+        return replace(self, levels={k: (change(patch), change(special)) for k, (patch, special) in self.levels.items()})
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return everything as named tensors, for a cache or a file."""
+        named = {f"{layer}.patch": patch for layer, (patch, _) in self.levels.items()}
+        named |= {f"{layer}.special": special for layer, (_, special) in self.levels.items()}
+        return {**named, **_meta_tensors(self)}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
+        """Rebuild what `tensors` returned."""
+        layers = sorted(int(k.removesuffix(".patch")) for k in tensors if k.endswith(".patch"))
+        levels = {i: (tensors[f"{i}.patch"], tensors[f"{i}.special"]) for i in layers}
+        return cls(levels=levels, **_read_meta(tensors))
+
+
+def _meta_tensors(value: ViewTokens | Features) -> dict[str, Tensor]:
+    return {name: torch.tensor(getattr(value, name)) for name in _META_KEYS}
+
+
+def _read_meta(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, int]]:
+    return {name: (int(tensors[name][0]), int(tensors[name][1])) for name in _META_KEYS}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cameras:
+    """Known cameras of a view set."""
+
+    T_cam_world: Tensor
+    """(..., S, 4, 4)."""
+    K: Tensor
+    """(..., S, 3, 3), pixels of the images they travel with."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """A network's answer at the network's resolution; what a model does not predict, or was not asked for, is None."""
+
+    depth_z: Tensor | None = None
+    """(..., S, H, W), up to scale unless the model is metric."""
+    conf: Tensor | None = None
+    """(..., S, H, W), in (1, inf), higher is better, not calibrated."""
+    T_cam_world: Tensor | None = None
+    """(..., S, 4, 4)."""
+    K: Tensor | None = None
+    """(..., S, 3, 3), pixels of the H x W map."""
+    sky: Tensor | None = None
+    """(..., S, H, W)."""
+    rays: Tensor | None = None
+    """(..., S, h, w, 7): direction, origin, confidence."""
+    points: Tensor | None = None
+    """(..., S, H, W, 4): world point and its confidence."""
+
+    def map(self, change) -> Self:
+        """Apply `change` to every tensor that is there."""
+        present = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{k: change(v) for k, v in present.items() if v is not None})
