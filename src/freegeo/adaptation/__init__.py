@@ -1,0 +1,1 @@
+"""Test-time adaptation: recipe, view sets, teacher targets, losses, adapter, trainer."""

@@ -1,0 +1,188 @@
+"""LoRA on the cross-view layers together with the camera token: attach, switch off, scale, fold in, take out.
+
+peft owns the LoRA layers; the camera token is a parameter, not a module, so it is owned here and swapped into the model
+while the adapter is on. The base weights are never touched before `merge`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from freegeo.errors import UserError
+
+if TYPE_CHECKING:
+    from peft import LoraConfig
+    from peft.tuners.lora import LoraLayer
+
+    from freegeo.models.api import ReconstructionModel
+
+ADAPTER_NAME = "default"
+
+
+def count_trainable(model: ReconstructionModel, rank: int) -> int:
+    """Return how many parameters an adapter of a rank trains: r (in + out) per linear, and the camera token.
+
+    The model may be on the meta device.
+    """
+    part = model.adaptable()
+    linears = [part.get_submodule(name) for name in part.adapter_targets()]
+    lora = sum(rank * (linear.in_features + linear.out_features) for linear in linears)
+    token = part.get_parameter(part.camera_token_name).numel() if part.camera_token_name else 0
+    return lora + token
+
+
+class Adapter:
+    """An adapter in place on a model: on by default, with strength 1.
+
+    A fresh one changes nothing: LoRA's B matrices are zero and the camera token is a copy.
+    """
+
+    def __init__(self, model: ReconstructionModel, lora_config: LoraConfig, layers: dict[str, LoraLayer]):
+        self.model = model
+        self.lora_config = lora_config
+        self.layers = layers
+        self._base_token = _parameter(model, model.camera_token_name)
+        self.camera_token = None if self._base_token is None else nn.Parameter(self._base_token.detach().clone())
+        self._scaling = {name: layer.scaling[ADAPTER_NAME] for name, layer in layers.items()}
+        self.strength = 1.0
+        self._install_token(self.camera_token)
+
+    @classmethod
+    def attach(
+        cls,
+        model: ReconstructionModel,
+        *,
+        rank: int,
+        alpha: int,
+        dropout: float,
+        generator: torch.Generator,
+        targets: Sequence[str] | None = None,
+    ) -> Adapter:
+        """Put a fresh adapter on a model (all of `adapter_targets` unless `targets` are given).
+
+        A is drawn from U(+-1/sqrt(fan_in)) with `generator`. UserError when the model already has an adapter or a
+        target is not one of its linear layers.
+        """
+        from peft import LoraConfig, inject_adapter_in_model
+        from peft.tuners.lora import LoraLayer
+
+        part = model.adaptable()
+        if any(isinstance(module, LoraLayer) for module in part.modules()):
+            raise UserError("the model already carries an adapter; detach it first.")
+        wanted = sorted(part.adapter_targets() if targets is None else targets)
+        modules = dict(part.named_modules())
+        unmatched = [name for name in wanted if not isinstance(modules.get(name), nn.Linear)]
+        if unmatched:
+            raise UserError(
+                f"{len(unmatched)} of {len(wanted)} adapter targets are no linear layers of {part.spec.name} "
+                f"(first: {unmatched[0]}). The adapter belongs to another model."
+            )
+        config = LoraConfig(r=rank, lora_alpha=alpha, lora_dropout=dropout, target_modules=list(wanted), bias="none")
+        inject_adapter_in_model(config, part, adapter_name=ADAPTER_NAME)
+        layers = {name: part.get_submodule(name) for name in wanted}
+        for layer in layers.values():
+            _draw_start(layer, generator)
+        config.target_modules = wanted
+        return cls(part, config, layers)
+
+    def named_parameters(self) -> dict[str, nn.Parameter]:
+        """Return everything that is trained, by name: `<module>.lora_A.weight`, `.lora_B.weight`, `camera_token`."""
+        named = {
+            f"{name}.{matrix}.weight": getattr(layer, matrix)[ADAPTER_NAME].weight
+            for name, layer in self.layers.items()
+            for matrix in ("lora_A", "lora_B")
+        }
+        return named if self.camera_token is None else {**named, "camera_token": self.camera_token}
+
+    def parameters(self) -> list[nn.Parameter]:
+        """Return the trained parameters in a fixed order."""
+        return list(self.named_parameters().values())
+
+    @torch.no_grad()
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """Copy trained values in, by the names of `named_parameters`; a missing camera token keeps the model's own."""
+        for name, parameter in self.named_parameters().items():
+            if name in tensors:
+                parameter.copy_(tensors[name])
+            elif name != "camera_token":
+                raise KeyError(name)
+        self.set_strength(self.strength)
+
+    @contextmanager
+    def off(self) -> Iterator[None]:
+        """Run the frozen model inside the block: LoRA bypassed, original camera token, nothing forgotten after it."""
+        token = _parameter(self.model, self.model.camera_token_name)
+        flags = [parameter.requires_grad for parameter in self.parameters()]
+        self._enable(False)
+        self._install_token(self._base_token)
+        try:
+            yield
+        finally:
+            self._enable(True)
+            self._install_token(token)
+            # peft clears and sets requires_grad when it switches adapters; ours are as they were.
+            for parameter, flag in zip(self.parameters(), flags, strict=True):
+                parameter.requires_grad_(flag)
+
+    def set_strength(self, strength: float) -> None:
+        """Interpolate between the frozen model (0) and the adapted one (1), LoRA and camera token together."""
+        self.strength = strength
+        for name, layer in self.layers.items():
+            layer.scaling[ADAPTER_NAME] = self._scaling[name] * strength
+        if self.camera_token is not None:
+            mixed = self.camera_token
+            if strength != 1:
+                mixed = nn.Parameter(self._base_token.lerp(self.camera_token.detach(), strength), requires_grad=False)
+            self._install_token(mixed)
+
+    def merge(self) -> ReconstructionModel:
+        """Fold the adapter (at its strength) into the weights and return the plain model; the adapter is used up."""
+        for layer in self.layers.values():
+            layer.merge(safe_merge=True)
+        self._remove_layers()
+        token = _parameter(self.model, self.model.camera_token_name)
+        if token is not None:
+            self._install_token(nn.Parameter(token.detach().clone(), requires_grad=False))
+        return self.model
+
+    def detach(self) -> ReconstructionModel:
+        """Take the adapter out and return the model as it was."""
+        self._remove_layers()
+        self._install_token(self._base_token)
+        return self.model
+
+    def _remove_layers(self) -> None:
+        for name, layer in self.layers.items():
+            owner, _, leaf = name.rpartition(".")
+            setattr(self.model.get_submodule(owner), leaf, layer.base_layer)
+        # peft notes its configuration on the model and would warn about a second adapter.
+        del self.model.peft_config
+
+    def _enable(self, enabled: bool) -> None:
+        for layer in self.layers.values():
+            layer.enable_adapters(enabled)
+
+    def _install_token(self, token: nn.Parameter | None) -> None:
+        if token is not None:
+            owner, _, leaf = self.model.camera_token_name.rpartition(".")
+            self.model.get_submodule(owner)._parameters[leaf] = token
+
+
+def _draw_start(layer: LoraLayer, generator: torch.Generator) -> None:
+    weight = layer.lora_A[ADAPTER_NAME].weight
+    bound = 1 / math.sqrt(weight.shape[1])
+    drawn = torch.rand(weight.shape, generator=generator) * 2 * bound - bound
+    with torch.no_grad():
+        weight.copy_(drawn)
+        layer.lora_B[ADAPTER_NAME].weight.zero_()
+
+
+def _parameter(model: nn.Module, name: str | None) -> nn.Parameter | None:
+    return None if name is None else model.get_parameter(name)
+

@@ -1,0 +1,218 @@
+"""The adaptation loss: intra + angles + distances, on the features of teacher and student."""
+
+from collections.abc import Mapping
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from freegeo.adaptation.losses.config import LossConfig
+from freegeo.adaptation.losses.divergence import (
+    Precision,
+    all_pairs_divergence,
+    pair_spread,
+    paired_divergence,
+)
+from freegeo.adaptation.losses.intra import intra_loss
+from freegeo.adaptation.losses.numerics import widened
+from freegeo.adaptation.losses.relational import angle_loss
+from freegeo.adaptation.losses.sampling import StepDraws, TokenDraw
+from freegeo.adaptation.losses.targets import Level, TeacherTargets, cross_tokens, intra_special
+from freegeo.errors import FreeGeoError
+
+
+def adaptation_loss(
+    student_levels: Mapping[int, Level],
+    teacher: TeacherTargets,
+    draws: StepDraws,
+    config: LossConfig,
+    *,
+    precision: Precision | None = None,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The total loss of one step (scalar, float32 or wider) and its detached terms.
+
+    student_levels: per loss layer the patches (B, M, P, C) and special tokens (B, M, T, C) of the kept views; the intra
+    loss is the mean over layers, the relational loss reads the highest layer number. draws: those that `teacher` was
+    made with, on any device; on the features' device nothing has to be moved. precision: see `all_pairs_divergence`;
+    only `pairing` "all" reads it, and None costs one host read per distance term there.
+
+    Terms: `total`; `intra` (weighted) and its unweighted parts `huber` and `cos` (mean of 1 - cosine); `cross`
+    (weighted); unweighted `phi1`, `phi2`, `phi3` (angles at reference, anchor, query) and `phi` (weighted sum);
+    unweighted `kl_pk`, `kl_pq`, `kl_kq`. Terms of weight 0 are absent. Raises `FreeGeoError` where the teacher's
+    layers are not the student's. Source: specs sections 2 and 3.1.
+    """
+    if student_levels.keys() != teacher.kept.keys():
+        raise FreeGeoError(
+            f"The student's features come from layers {sorted(student_levels)}, the teacher's from "
+            f"{sorted(teacher.kept)}; ask both branches for the same layers."
+        )
+    total, terms = _intra(student_levels, teacher, config)
+    cross: list[Tensor] = []
+    if config.uses_angles or config.uses_distances:
+        layer = max(student_levels)
+        student_draws, teacher_draws = (
+            _gather_draws(cross_tokens(config, levels[layer]), draws, config)
+            for levels in (student_levels, teacher.kept)
+        )
+        if config.uses_angles:
+            p_and_q = (_pooled(student_draws[0]), _pooled(teacher_draws[0]))
+            phi, parts = angle_loss(
+                *p_and_q,
+                teacher.anchors.angle,
+                weights=config.angle_weights,
+                penalty=config.angle_penalty,
+                huber_delta=config.angle_huber_delta,
+            )
+            cross.append(phi)
+            terms |= {"phi1": parts[0], "phi2": parts[1], "phi3": parts[2], "phi": phi}
+        distances = _distances(student_draws[1], teacher_draws[1], teacher.anchors.distance, config, precision)
+        for name, (weight, value) in distances.items():
+            cross.append(weight * value)
+            terms[name] = value
+        terms["cross"] = torch.stack(cross).sum()
+        total = total + terms["cross"]
+    terms["total"] = total
+    return total, {name: term.detach() for name, term in terms.items()}
+
+
+def _intra(
+    student_levels: Mapping[int, Level], teacher: TeacherTargets, config: LossConfig
+) -> tuple[Tensor, dict[str, Tensor]]:
+    per_layer = []
+    for layer, (patch, special) in student_levels.items():
+        kept_patch, kept_special = teacher.kept[layer]
+        pairs = [(patch, kept_patch), (intra_special(config, special), intra_special(config, kept_special))]
+        per_layer.append(
+            intra_loss(
+                pairs,
+                weight_huber=config.weight_huber,
+                weight_cosine=config.weight_cosine,
+                huber_delta=config.huber_delta,
+            )
+        )
+    intra, huber, cosine = (torch.stack(parts).mean() for parts in zip(*per_layer, strict=True))
+    return intra, {"intra": intra, "huber": huber, "cos": cosine}
+
+
+Tokens = tuple[Tensor, Tensor]
+"""References p (B, R, C) and queries q (B, G, Q, C) of one draw."""
+
+
+def _gather_draws(tokens: Tensor, draws: StepDraws, config: LossConfig) -> tuple[Tokens, Tokens]:
+    """The references and queries of the angle draw and of the distance draw.
+
+    tokens: (B, M, T, C). Everything is taken by one indexing operation, whose backward pass fills one gradient.
+    """
+    batch, views, per_view, channels = tokens.shape
+    chosen = [draws.angle] if draws.shared else [draws.angle, draws.distance]
+    positions = torch.cat([part for draw in chosen for part in _flat_positions(draw, per_view, config, tokens.device)])
+    gathered = widened(tokens.reshape(batch, views * per_view, channels).index_select(1, positions))
+    sizes = [size for draw in chosen for size in (draw.reference.numel(), draw.query.numel())]
+    parts = gathered.split(sizes, dim=1)
+    found = [
+        (parts[2 * number], parts[2 * number + 1].unflatten(1, draw.query.shape)) for number, draw in enumerate(chosen)
+    ]
+    return found[0], found[-1]
+
+
+def _flat_positions(draw: TokenDraw, per_view: int, config: LossConfig, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Positions of references and queries in the concatenation of all the student's views."""
+    reference, query = draw.reference.to(device), draw.query.to(device).flatten()
+    first = config.reference_view * per_view
+    # Queries count through the other views only: those from the reference view on lie one view further.
+    return reference + first, torch.where(query < first, query, query + per_view)
+
+
+def _pooled(tokens: Tokens) -> Tokens:
+    return tokens[0], tokens[1].flatten(1, 2)
+
+
+def _distances(
+    student: Tokens, teacher: Tokens, anchors: Tensor, config: LossConfig, precision: Precision | None
+) -> dict[str, tuple[float, Tensor]]:
+    """Weight and value of the distance terms that have a weight."""
+    weights = {"kl_pk": config.weight_pk, "kl_pq": config.weight_pq, "kl_kq": config.weight_kq}
+    anchors = widened(anchors)
+    values = {}
+    for name, weight in weights.items():
+        if not weight:
+            continue
+        if name == "kl_pk":
+            value = _reference_anchor(student, teacher, anchors, config)
+        elif config.pairing == "paired":
+            value = _paired(name, student, teacher, anchors, config)
+        else:
+            value = _all_pairs(name, student, teacher, anchors, config, precision)
+        values[name] = (weight, value)
+    return values
+
+
+def _pairs(tokens: Tokens) -> int:
+    """Number of pairs per row of `pairing` "paired"; references beyond it take part in no distance term."""
+    return min(tokens[0].shape[1], tokens[1].shape[2])
+
+
+def _reference_anchor(student: Tokens, teacher: Tokens, anchors: Tensor, config: LossConfig) -> Tensor:
+    used = _pairs(student) if config.pairing == "paired" else None
+    found, wanted = (p[:, :used, None] - anchors[:, :used] for p, _ in (student, teacher))
+    return _of_differences(found, wanted, config)
+
+
+def _paired(name: str, student: Tokens, teacher: Tokens, anchors: Tensor, config: LossConfig) -> Tensor:
+    """The i-th reference (or its anchors) with the i-th query of every row."""
+    pairs = _pairs(student)
+    if name == "kl_pq":
+        found, wanted = (p[:, None, :pairs] - q[:, :, :pairs] for p, q in (student, teacher))
+    else:
+        sign = 1 if config.kq_order == "kq" else -1
+        k = anchors[:, None, :pairs]
+        found, wanted = (sign * (k - q[:, :, :pairs, None]) for _, q in (student, teacher))
+    return _of_differences(found, wanted, config)
+
+
+def _all_pairs(
+    name: str, student: Tokens, teacher: Tokens, anchors: Tensor, config: LossConfig, precision: Precision | None
+) -> Tensor:
+    """Every reference (or every anchor of every reference) with every query."""
+    student, teacher = _pooled(student), _pooled(teacher)
+    if name == "kl_kq":
+        k = anchors.flatten(1, 2)
+        student, teacher = (k, student[1]), (k, teacher[1])
+        if config.kq_order == "qk":
+            student, teacher = student[::-1], teacher[::-1]
+    kl = all_pairs_divergence(student, teacher, temperature=config.temperature, precision=precision)
+    return _outer(kl, config).mean()
+
+
+def _of_differences(found: Tensor, wanted: Tensor, config: LossConfig) -> Tensor:
+    if config.distance_mode == "huber":
+        return F.smooth_l1_loss(found, wanted, beta=config.distance_beta)
+    return _outer(paired_divergence(found, wanted, temperature=config.temperature), config).mean()
+
+
+def _outer(kl: Tensor, config: LossConfig) -> Tensor:
+    if config.outer == "none":
+        return kl
+    return F.smooth_l1_loss(kl, torch.zeros_like(kl), beta=config.outer_beta, reduction="none")
+
+
+def teacher_spread(teacher: TeacherTargets, draws: StepDraws, config: LossConfig) -> Tensor:
+    """The largest spread of the teacher's softmax inputs over the pairs of `pairing` "all", a scalar tensor.
+
+    Read once per view set, `choose_precision(spread, headroom=...)` spares the step its host reads.
+    """
+    tokens = cross_tokens(config, teacher.kept[max(teacher.kept)])
+    p, q = _pooled(_gather_draws(tokens, draws, config)[1])
+    anchors = widened(teacher.anchors.distance).flatten(1, 2)
+    return torch.stack([pair_spread(x, q, config.temperature) for x in (p, anchors)]).amax()
+
+
+def require_finite(terms: Mapping[str, Tensor], *, step: int) -> None:
+    """Raise `FreeGeoError` naming the first term of `terms` (scalars) that is not finite; reads the host once."""
+    finite = torch.stack([term.detach().float() for term in terms.values()]).isfinite().tolist()
+    for name, is_finite in zip(terms, finite, strict=True):
+        if not is_finite:
+            raise FreeGeoError(
+                f"Loss term {name} is not finite at step {step}: lower the learning rate, or run with "
+                "--precision fp32 to rule out an overflow of half precision."
+            )

@@ -1,0 +1,209 @@
+"""The distance terms: KL between teacher and student distributions `softmax((a - b)/tau)` over channels.
+
+All pairs of two token sets are evaluated through matrix products of per-token exponentials (specs section 7.2), whose
+range decides the precision (section 7.3); chosen pairs are evaluated from the definition.
+"""
+
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from freegeo.adaptation.losses.numerics import block_elements, blocks, exact_matmul, widened
+
+Precision = Literal["float32", "float64", "direct"]
+"""How all-pairs KL is evaluated: matrix products in float32 or in float64, or the definition pair by pair."""
+
+FLOAT32_SPREAD, FLOAT64_SPREAD = 70.0, 650.0
+
+
+def choose_precision(spread: float, *, headroom: float = 1.0) -> Precision:
+    """The cheapest safe evaluation for softmax inputs of this `spread` (see `pair_spread`); specs section 7.3.
+
+    headroom: factor by which the spread may grow before the choice is unsafe; above 1 where the teacher's spread is
+    measured once and stands for a student that drifts from it.
+    """
+    if spread * headroom <= FLOAT32_SPREAD:
+        return "float32"
+    return "float64" if spread * headroom <= FLOAT64_SPREAD else "direct"
+
+
+def _centred(x: Tensor, y: Tensor, common: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
+    """x/tau and y/tau less a common vector and less each token's channel mean: no softmax of a difference changes.
+
+    The common vector takes out the outlier channels that all tokens of a ViT share, which is what keeps the
+    exponentials in range.
+    """
+    x, y = (x - common).div_(temperature), (y - common).div_(temperature)
+    return x.sub_(x.mean(-1, keepdim=True)), y.sub_(y.mean(-1, keepdim=True))
+
+
+def _mean_token(x: Tensor, y: Tensor) -> Tensor:
+    return torch.cat([x, y], dim=1).mean(1, keepdim=True)
+
+
+@torch.no_grad()
+def pair_spread(x: Tensor, y: Tensor, temperature: float) -> Tensor:
+    """S of the pairs x (B, R, C), y (B, m, C), a scalar tensor: partition functions are at least C exp(-S)."""
+    x, y = widened(x), widened(y)
+    x, y = _centred(x, y, _mean_token(x, y), temperature)
+    return (x.amax((1, 2)) - y.amin((1, 2))).amax()
+
+
+class _ProductPairs(torch.autograd.Function):
+    """KL of all pairs by matrix products. Inputs are centred; gradients are those of softmax inputs x and y."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, y: Tensor, teacher_x: Tensor, teacher_y: Tensor, same_x: bool) -> Tensor:
+        x_top, y_top = x.amax(-1, keepdim=True), (-y).amax(-1, keepdim=True)
+        teacher_x_top, teacher_y_top = teacher_x.amax(-1, keepdim=True), (-teacher_y).amax(-1, keepdim=True)
+        e, f = (x - x_top).exp_(), (-y - y_top).exp_()
+        teacher_e = e if same_x else (teacher_x - teacher_x_top).exp_()
+        teacher_f = (-teacher_y - teacher_y_top).exp_()
+        with exact_matmul(x):
+            z, teacher_z = e @ f.mT, teacher_e @ teacher_f.mT
+            # Mean over the teacher's distribution of (x' - y') - (x - y).
+            cross = teacher_e @ (teacher_f * (y - teacher_y)).mT
+            if not same_x:
+                cross.baddbmm_(teacher_e * (teacher_x - x), teacher_f.mT)
+        kl = cross.div_(teacher_z).add_(z.log()).sub_(teacher_z.log())
+        kl.add_(x_top - teacher_x_top).add_((y_top - teacher_y_top).mT)
+        ctx.save_for_backward(e, f, teacher_e, teacher_f, z, teacher_z)
+        return kl
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None]:
+        e, f, teacher_e, teacher_f, z, teacher_z = ctx.saved_tensors
+        by_z, by_teacher_z = grad / z, grad / teacher_z
+        grad_x = grad_y = None
+        with exact_matmul(e):
+            if ctx.needs_input_grad[0]:
+                grad_x = (by_z @ f).mul_(e).sub_((by_teacher_z @ teacher_f).mul_(teacher_e))
+            if ctx.needs_input_grad[1]:
+                grad_y = (by_teacher_z.mT @ teacher_e).mul_(teacher_f).sub_((by_z.mT @ e).mul_(f))
+        return grad_x, grad_y, None, None, None
+
+
+class _DirectPairs(torch.autograd.Function):
+    """KL of all pairs from the definition, block by block; the backward pass forms the distributions again."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, y: Tensor, teacher_x: Tensor, teacher_y: Tensor) -> Tensor:
+        ctx.save_for_backward(x, y, teacher_x, teacher_y)
+        parts = []
+        for part in _pair_blocks(x, y):
+            student = _log_softmax(x[:, part], y)
+            teacher = _log_softmax(teacher_x[:, part], teacher_y)
+            parts.append((teacher.exp() * (teacher - student)).sum(-1))
+        return torch.cat(parts, dim=1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        x, y, teacher_x, teacher_y = ctx.saved_tensors
+        grad_x, grad_y = torch.zeros_like(x), torch.zeros_like(y)
+        for part in _pair_blocks(x, y):
+            surplus = _log_softmax(x[:, part], y).exp_()
+            surplus.sub_(_log_softmax(teacher_x[:, part], teacher_y).exp_()).mul_(grad[:, part, :, None])
+            grad_x[:, part] = surplus.sum(2)
+            grad_y.sub_(surplus.sum(1))
+        return grad_x, grad_y, None, None
+
+
+def _pair_blocks(x: Tensor, y: Tensor):
+    return blocks(x.shape[1], block_elements(x) // y.numel())
+
+
+def _log_softmax(x: Tensor, y: Tensor) -> Tensor:
+    return F.log_softmax(x[:, :, None] - y[:, None], dim=-1)
+
+
+def all_pairs_divergence(
+    student: tuple[Tensor, Tensor],
+    teacher: tuple[Tensor, Tensor],
+    *,
+    temperature: float,
+    precision: Precision | None,
+) -> Tensor:
+    """KL(softmax((x' - y')/tau) || softmax((x - y)/tau)) for every pair, (B, R, m), in float32 or wider.
+
+    student: (x (B, R, C), y (B, m, C)); teacher: (x', y') of the same shapes. Passing one tensor object as x and x'
+    (or as y and y') saves its products; the gradient goes to the student's tensors. precision None measures
+    the spread of the softmax inputs, which reads one number back to the host; a given `float32` or `float64` is
+    not checked and yields non-finite values where the spread is too large for it. Source: specs sections 7.2, 7.3.
+    """
+    same_x, same_y = student[0] is teacher[0], student[1] is teacher[1]
+    if same_y and not same_x:
+        return _transposed(student, teacher, temperature=temperature, precision=precision)
+    x, y = map(widened, student)
+    teacher_x, teacher_y = (widened(tensor).detach() for tensor in teacher)
+    wide = x.dtype
+    with torch.no_grad():
+        if precision is None:
+            spreads = [pair_spread(x, y, temperature), pair_spread(teacher_x, teacher_y, temperature)]
+            precision = choose_precision(float(torch.stack(spreads).amax()))
+        teacher_common = _mean_token(teacher_x, teacher_y)
+        # One vector for both branches where they share x, so that its exponentials are shared too.
+        common = teacher_common if same_x else _mean_token(x, y)
+    if precision == "float64":
+        x, y, teacher_x, teacher_y, common, teacher_common = (
+            tensor.double() for tensor in (x, y, teacher_x, teacher_y, common, teacher_common)
+        )
+    x, y = _centred(x, y, common, temperature)
+    teacher_x, teacher_y = _centred(teacher_x, teacher_y, teacher_common, temperature)
+    if precision == "direct":
+        return _DirectPairs.apply(x, y, teacher_x, teacher_y)
+    return _ProductPairs.apply(x, y, teacher_x, teacher_y, same_x).to(wide)
+
+
+def _transposed(
+    student: tuple[Tensor, Tensor], teacher: tuple[Tensor, Tensor], *, temperature: float, precision: Precision | None
+) -> Tensor:
+    """Pairs that share y instead of x: x - y = (-y) - (-x)."""
+    shared = -teacher[1]
+    flipped = all_pairs_divergence(
+        (shared, -student[0]), (shared, -teacher[0]), temperature=temperature, precision=precision
+    )
+    return flipped.mT
+
+
+class _PairedKL(torch.autograd.Function):
+    """KL per difference vector; one exponential per element and branch, and only the gradient is kept."""
+
+    @staticmethod
+    def forward(ctx, student: Tensor, teacher: Tensor, temperature: float) -> Tensor:
+        rows, channels = student.shape
+        kl = torch.empty(rows, dtype=widened(student[:0]).dtype, device=student.device)
+        gradient = torch.empty_like(student, dtype=kl.dtype) if ctx.needs_input_grad[0] else None
+        for part in blocks(rows, block_elements(student) // channels):
+            log_found, found = _log_and_softmax(student[part], temperature)
+            log_wanted, wanted = _log_and_softmax(teacher[part], temperature)
+            kl[part] = log_wanted.sub_(log_found).mul_(wanted).sum(-1)
+            if gradient is not None:
+                torch.sub(found, wanted, out=gradient[part]).div_(temperature)
+        ctx.save_for_backward(gradient)
+        ctx.student_dtype = student.dtype
+        return kl
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, None, None]:
+        (gradient,) = ctx.saved_tensors
+        return (gradient * grad[:, None]).to(ctx.student_dtype), None, None
+
+
+def _log_and_softmax(difference: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
+    logits = widened(difference) / temperature
+    logits.sub_(logits.amax(-1, keepdim=True))
+    exponentials = logits.exp()
+    partition = exponentials.sum(-1, keepdim=True)
+    return logits.sub_(partition.log()), exponentials.div_(partition)
+
+
+def paired_divergence(student: Tensor, teacher: Tensor, *, temperature: float) -> Tensor:
+    """KL(softmax(d'/tau) || softmax(d/tau)) of difference vectors d, d' (..., C): (...), in float32 or wider."""
+    rows = student.flatten(0, -2), teacher.detach().flatten(0, -2)
+    return _PairedKL.apply(*rows, temperature).view(student.shape[:-1])

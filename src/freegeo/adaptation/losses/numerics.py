@@ -1,0 +1,50 @@
+"""How the losses compute: in float32 or wider, with exact matrix products, over blocks that fit in cache."""
+
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+# Elements per block of a temporary array. On a CPU 0.5 MB in float32: the arrays in play stay in the shared cache, and
+# the cost of an operator call (a few microseconds) stays small. On an accelerator a block only has to bound the memory.
+CPU_BLOCK_ELEMENTS = 1 << 17
+DEVICE_BLOCK_ELEMENTS = 1 << 25
+
+
+def block_elements(tensor: Tensor) -> int:
+    """Number of elements that one temporary array of a blocked loop over `tensor` should have on its device."""
+    return CPU_BLOCK_ELEMENTS if tensor.device.type == "cpu" else DEVICE_BLOCK_ELEMENTS
+
+
+def blocks(length: int, size: int) -> Iterator[slice]:
+    """Slices that cover `range(length)` in order, each at most `max(size, 1)` long."""
+    step = max(size, 1)
+    for start in range(0, length, step):
+        yield slice(start, min(start + step, length))
+
+
+def widened(tensor: Tensor) -> Tensor:
+    """`tensor` in float32, or unchanged where it is float64 already."""
+    return tensor if tensor.dtype == torch.float64 else tensor.float()
+
+
+@contextmanager
+def exact_matmul(tensor: Tensor) -> Generator[None]:
+    """Matrix products on the device of `tensor` in the full precision of their inputs: no autocast, no TF32.
+
+    A KL value is a small difference of large logarithms, and the zero-length rule of the angles assumes the rounding
+    of float32 (specs section 7.1 and 7.3). The setting found is put back on the way out.
+    """
+    with torch.autocast(device_type=tensor.device.type, enabled=False):
+        if tensor.device.type != "cuda":
+            yield
+            return
+        settings = torch.backends.cuda.matmul
+        name, exact = ("fp32_precision", "ieee") if hasattr(settings, "fp32_precision") else ("allow_tf32", False)
+        previous = getattr(settings, name)
+        setattr(settings, name, exact)
+        try:
+            yield
+        finally:
+            setattr(settings, name, previous)

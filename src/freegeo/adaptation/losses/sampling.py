@@ -1,0 +1,121 @@
+"""Which tokens form the triplets: random references and queries, anchors by similarity to the reference.
+
+Draws are separate from the loss: they can be made in advance from the seed of a run, kept beside a teacher cache, or be
+replaced by recorded indices. One draw is shared by the samples of a batch.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from freegeo.adaptation.losses.config import LossConfig, Selection
+from freegeo.adaptation.losses.numerics import blocks, exact_matmul, widened
+from freegeo.errors import UserError
+
+SIMILARITY_ELEMENTS = 1 << 24  # one block of the similarity matrix: 64 MB in float32
+
+
+@dataclass(frozen=True, kw_only=True)
+class TokenDraw:
+    """Token positions of one draw; T is the number of tokens per view that the draw chose from."""
+
+    reference: Tensor
+    """(R,) int64: positions 0..T-1 in the reference view."""
+    query: Tensor
+    """(G, Q) int64: positions in the concatenation of the student's other views (ascending, T tokens each). G is 1
+    for pooled queries; else one row per view. Paired terms join reference i with column i of every row."""
+    anchor: Tensor | None = None
+    """(R, K) or (B, R, K) int64: positions in the concatenation of the held-out views (ascending, T tokens each).
+    None: the anchors are found by similarity."""
+
+    def to(self, device: torch.device | str) -> "TokenDraw":
+        """The same draw on another device."""
+        anchor = None if self.anchor is None else self.anchor.to(device)
+        return replace(self, reference=self.reference.to(device), query=self.query.to(device), anchor=anchor)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepDraws:
+    """The draws of one training step; both fields are the same object where the terms share one draw."""
+
+    angle: TokenDraw
+    distance: TokenDraw
+
+    @property
+    def shared(self) -> bool:
+        """Whether the angle terms and the distance terms use one draw."""
+        return self.angle is self.distance
+
+    def to(self, device: torch.device | str) -> "StepDraws":
+        """The same draws on another device."""
+        angle = self.angle.to(device)
+        return StepDraws(angle=angle, distance=angle if self.shared else self.distance.to(device))
+
+
+def draw_tokens(
+    config: LossConfig, *, tokens_per_view: int, student_views: int, held_out_views: int, generator: torch.Generator
+) -> StepDraws:
+    """Draw the references and queries of one step (CPU tensors).
+
+    tokens_per_view: tokens that `config.cross_tokens` lets take part (patches, or special tokens and patches).
+    Where a view has fewer tokens than asked for, all are drawn. The generator is read in this order: references,
+    queries and, for random selection, anchors of the angle draw; then the same for a separate distance draw.
+    Raises `UserError` where the views cannot form a triplet.
+    """
+    if not 0 <= config.reference_view < student_views:
+        raise UserError(
+            f"Loss setting reference_view is {config.reference_view}, but the student sees {student_views} views; "
+            "choose a view that it sees."
+        )
+    if student_views < 2 or held_out_views < 1:
+        raise UserError(
+            f"The relational loss needs 2 kept views and 1 held-out view, not {student_views} and {held_out_views}; "
+            "use at least 3 views."
+        )
+    sizes = (tokens_per_view, student_views - 1, held_out_views)
+    angle = _draw(config, *sizes, generator)
+    return StepDraws(angle=angle, distance=_draw(config, *sizes, generator) if config.separate_draws else angle)
+
+
+def _draw(config: LossConfig, tokens: int, other_views: int, held_out: int, generator: torch.Generator) -> TokenDraw:
+    reference = torch.randperm(tokens, generator=generator)[: config.num_reference]
+    if config.queries == "pooled":
+        query = torch.randperm(other_views * tokens, generator=generator)[None, : config.num_query]
+    else:
+        positions = torch.randperm(tokens, generator=generator)[: config.num_query]
+        query = positions + tokens * torch.arange(other_views)[:, None]
+    anchor = None
+    if config.selection == "random":
+        shape = (len(reference), config.num_anchors)
+        anchor = torch.randint(held_out * tokens, shape, generator=generator)
+    return TokenDraw(reference=reference, query=query, anchor=anchor)
+
+
+@torch.no_grad()
+def search_anchors(reference: Tensor, held_out: Tensor, *, num_anchors: int, selection: Selection) -> Tensor:
+    """Positions (B, R, K) of the anchors among the held-out tokens, by cosine similarity of teacher features.
+
+    reference: (B, R, C); held_out: (B, L, C), the held-out views one after another. `topk`: the K most similar,
+    best first; `mixed`: the K//2 most similar, best first, then the K - K//2 least similar, worst first.
+    Raises `UserError` where there are fewer than K tokens, or for `random`, whose anchors belong to the draw.
+    """
+    if selection == "random":
+        raise UserError("Random anchors are part of the token draw; make the draw with selection 'random'.")
+    if held_out.shape[1] < num_anchors:
+        raise UserError(
+            f"The held-out views have {held_out.shape[1]} tokens, fewer than the {num_anchors} anchors per reference; "
+            "lower num_anchors or use larger images."
+        )
+    most = num_anchors // 2 if selection == "mixed" else num_anchors
+    directions = F.normalize(widened(held_out), dim=-1).mT
+    reference = F.normalize(widened(reference), dim=-1)
+    chosen = []
+    with exact_matmul(reference):
+        for part in blocks(reference.shape[1], SIMILARITY_ELEMENTS // (len(held_out) * held_out.shape[1])):
+            similarity = reference[:, part] @ directions
+            nearest = similarity.topk(most, dim=-1).indices
+            farthest = similarity.topk(num_anchors - most, dim=-1, largest=False).indices
+            chosen.append(torch.cat([nearest, farthest], dim=-1))
+    return torch.cat(chosen, dim=1)

@@ -1,0 +1,94 @@
+"""Which frames form a view set, which of them the student keeps, and in which order the sets are visited."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+
+import torch
+
+from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
+from freegeo.errors import UserError
+
+EPOCH_SEED_STRIDE = 1_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewSet:
+    """The views of one training sample."""
+
+    scene: int
+    """Number of the scene in the run."""
+    frames: tuple[int, ...]
+    """Frames of the scene that the teacher sees, ascending; repeats only where a recipe pads small scenes."""
+    kept: tuple[int, ...]
+    """Positions in `frames` that the student sees."""
+    seed: int
+
+
+def draw_frames(count: int, views: int, seed: int, *, repeat: bool) -> tuple[int, ...]:
+    """Draw the frames of a view set from `count` frames (method's fact sheet, section 3.3), ascending.
+
+    With at most `views` frames all are used; `repeat` then fills up with random repeats.
+    """
+    generator = random.Random(seed)
+    if count > views:
+        return tuple(sorted(generator.sample(range(count), views)))
+    frames = list(range(count))
+    if repeat:
+        frames += [generator.choice(range(count)) for _ in range(views - count)]
+    return tuple(sorted(frames))
+
+
+def kept_positions(views: int, keep: tuple[int, ...] | None) -> tuple[int, ...]:
+    """Return the student's positions: the recipe's where they fit, else every second view."""
+    return keep if keep is not None and keep[-1] < views else tuple(range(0, views, 2))
+
+
+def view_sets(frame_counts: list[int], recipe: Recipe, epoch: int = 0) -> list[ViewSet]:
+    """Draw all view sets of one epoch, scene by scene.
+
+    Sets stay the same over the epochs unless the recipe redraws. Small scenes may give the same set several times.
+    UserError for a scene with fewer than 3 frames.
+    """
+    sets = []
+    for scene, count in enumerate(frame_counts):
+        if count < SMALLEST_SCENE:
+            raise UserError(
+                f"adaptation needs at least {SMALLEST_SCENE} photos, got {count}. Add photos, or reconstruct without "
+                "adapting (--no-adapt)."
+            )
+        for number in range(recipe.sets_per_scene):
+            seed = recipe.first_seed + number % recipe.distinct_seeds
+            seed += EPOCH_SEED_STRIDE * epoch if recipe.redraw else 0
+            frames = draw_frames(count, recipe.views, seed, repeat=recipe.repeat_views)
+            sets.append(ViewSet(scene=scene, frames=frames, kept=kept_positions(len(frames), recipe.keep), seed=seed))
+    return sets
+
+
+@dataclass(frozen=True, kw_only=True)
+class Visit:
+    """One use of a view set in an optimiser step."""
+
+    step: int
+    epoch: int
+    view_set: ViewSet
+
+
+def schedule(frame_counts: list[int], recipe: Recipe, seed: int) -> list[list[Visit]]:
+    """Return the visits of every optimiser step: epochs in shuffled order, cut into batches."""
+    generator = torch.Generator().manual_seed(seed)
+    steps: list[list[Visit]] = []
+    epoch = 0
+    while recipe.steps is None or len(steps) < recipe.steps:
+        if recipe.epochs is not None and epoch == recipe.epochs:
+            break
+        sets = view_sets(frame_counts, recipe, epoch)
+        order = torch.randperm(len(sets), generator=generator).tolist()
+        batches = [order[i : i + recipe.batch] for i in range(0, len(order), recipe.batch)]
+        if recipe.drop_last and len(batches[-1]) < recipe.batch and len(batches) > 1:
+            batches.pop()
+        for batch in batches:
+            steps.append([Visit(step=len(steps), epoch=epoch, view_set=sets[i]) for i in batch])
+        epoch += 1
+    return steps[: recipe.steps]
