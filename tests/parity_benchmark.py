@@ -225,9 +225,10 @@ def _datasets(folder: Path) -> Iterator[Case]:
         recorded = _read(path)
         dataset = recorded["dataset"]
         yield f"{dataset}/parameters", partial(_parameter_error, dataset, recorded["parameters"])
+        for scene, entry in recorded["scenes"].items():
+            if (folder / "datasets" / dataset / entry["loader"]["image_files"][0]).is_file():
+                yield from _scene_cases(folder, dataset, scene, entry)
         here = [scene for scene in recorded["scenes"] if _prediction_path(folder, dataset, scene).is_file()]
-        for scene in here:
-            yield from _scene_cases(folder, dataset, scene, recorded["scenes"][scene])
         if len(here) == len(recorded["scenes"]):
             for views, seeds in recorded["pipeline"]["runs"].items():
                 for seed, run in seeds.items():
@@ -241,6 +242,8 @@ def _scene_cases(folder: Path, dataset: str, scene: str, recorded: dict) -> Iter
         yield f"{name}/cameras", partial(_camera_error, folder, scene, recorded["loader"])
     yield f"{name}/gt_mask", partial(_gt_mask_error, folder, dataset, scene, recorded["gt_mask"])
     full = recorded["full_sequence"]
+    if not _prediction_path(folder, dataset, scene).is_file():
+        return
     yield f"{name}/pose", partial(_full_pose_error, folder, dataset, scene, full["pose"])
     for mode in ("recon_unposed", "recon_posed"):
         yield f"{name}/{mode}/fusion", partial(_fusion_error, folder, dataset, scene, mode, full[mode])
@@ -260,14 +263,19 @@ def _prediction_path(folder: Path, dataset: str, scene: str) -> Path:
 
 
 @cache
+def _scene(folder: Path, dataset: str, scene: str):
+    return datasets.load_scene(folder / "datasets", dataset, scene)
+
+
+@cache
 def _loaded(folder: Path, dataset: str, scene: str):
-    loaded = datasets.load_scene(folder / "datasets", dataset, scene)
-    return loaded, read_published_prediction(_prediction_path(folder, dataset, scene))
+    prediction = read_published_prediction(_prediction_path(folder, dataset, scene))
+    return _scene(folder, dataset, scene), prediction
 
 
 @cache
 def _reference(folder: Path, dataset: str, scene: str):
-    return load_reference(_loaded(folder, dataset, scene)[0])
+    return load_reference(_scene(folder, dataset, scene))
 
 
 def _parameter_error(dataset: str, recorded: dict) -> float:
@@ -284,7 +292,7 @@ def _parameter_error(dataset: str, recorded: dict) -> float:
 
 
 def _loader_error(folder: Path, dataset: str, scene: str, recorded: dict) -> float:
-    loaded, _ = _loaded(folder, dataset, scene)
+    loaded = _scene(folder, dataset, scene)
     root = folder / "datasets" / dataset
     truth = loaded.truth
     assert truth is not None
@@ -323,7 +331,7 @@ def _camera_error(folder: Path, scene: str, recorded: dict) -> float:
 
 
 def _gt_mask_error(folder: Path, dataset: str, scene: str, recorded: list) -> float:
-    loaded, _ = _loaded(folder, dataset, scene)
+    loaded = _scene(folder, dataset, scene)
     for index, expected in enumerate(recorded):
         size_hw = datasets.protocol(dataset).fusion_hw or loaded.photos[index].size_hw
         mask = datasets.valid_mask(loaded.truth, index, size_hw)

@@ -49,6 +49,13 @@ def cases(folder: Path) -> Iterator[tuple[str, Check]]:
 
 def build(folder: Path) -> DA3:
     """Build and load the small model of a fixture folder."""
+    model = build_on_meta(lambda: empty_model(folder))
+    load_weights(model, folder / "weights.safetensors", da3_presets.keys(), folder.name)
+    return model.eval()
+
+
+def empty_model(folder: Path) -> DA3:
+    """Build the small model of a fixture folder without weights."""
     values = json.loads((folder / "config.json").read_text())
     net, head = values["net"], values["head"]
     config = DA3Config(
@@ -62,9 +69,7 @@ def build(folder: Path) -> DA3:
         name=folder.name, patch_size=14, default_side=504, loss_layers=config.out_layers, reference="saddle_balanced",
         special_tokens=1, weights_licence="none", adaptation=AdaptationDefaults(temperature=10.0, scene_lr=3e-5),
     )  # fmt: skip
-    model = build_on_meta(lambda: DA3(config, spec))
-    load_weights(model, folder / "weights.safetensors", da3_presets.keys(), folder.name)
-    return model.eval()
+    return DA3(config, spec)
 
 
 @torch.no_grad()

@@ -13,6 +13,9 @@ __version__ = "0.1.0"
 _HOMES = {
     "load_model": "freegeo.models.catalog",
     "load_photos": "freegeo.data.photos",
+    "adapt": "freegeo.pipeline",
+    "reconstruct": "freegeo.pipeline",
+    "evaluate": "freegeo.benchmark.scene_score",
 }
 
 __all__ = ["__version__", *_HOMES]

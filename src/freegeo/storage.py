@@ -10,7 +10,7 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -25,7 +25,7 @@ LOCK_FILE = ".freegeo-lock"
 
 
 @contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
+def atomic_path(path: Path) -> Generator[Path]:
     """Give a temporary path beside `path` to write to; it takes the final name only when the block succeeds.
 
     The temporary name keeps the suffix, since writers choose the format by it. UserError when the folder cannot be
@@ -84,7 +84,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Any], metadata: Mapping[str,
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path) -> Generator[None]:
     """Hold a folder against other processes; the lock goes with the process, however it ends."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -107,7 +107,7 @@ def _try_lock(handle) -> bool:
         if os.name == "nt":
             import msvcrt
 
-            msvcrt.locking(handle.fileno(), msvcrt.LK_NBLCK, 1)  # ty: ignore[possibly-missing-attribute]
+            msvcrt.locking(handle.fileno(), msvcrt.LK_NBLCK, 1)
         else:
             import fcntl
 
@@ -140,7 +140,7 @@ class RunFolder:
 
 
 @contextmanager
-def run_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool = False) -> Iterator[RunFolder]:
+def run_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool = False) -> Generator[RunFolder]:
     """Open an output folder for a command with JSON-like settings.
 
     Absent or empty: it is started. Unfinished with the same settings: it goes on. Finished with the same settings:

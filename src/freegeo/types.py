@@ -7,12 +7,31 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Self
+from typing import Protocol, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
 _META_KEYS = ("image_hw", "grid_hw")
+
+
+class PhotoLike(Protocol):
+    """What models and scenes need of a photo; `freegeo.data.photos.Photo` is one."""
+
+    @property
+    def name(self) -> str:
+        """Short name, unique within the scene."""
+        ...
+
+    @property
+    def size_hw(self) -> tuple[int, int]:
+        """Height and width of the upright photo."""
+        ...
+
+    def read(self) -> np.ndarray:
+        """Decode to upright RGB (H, W, 3) uint8."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,9 +143,7 @@ class Features:
 
     def select(self, views: Sequence[int]) -> Self:
         """Return the chosen views, in the order given ("8->4" is `select([0, 2, 4, 6])`)."""
-        return self._map(
-            lambda t: t.index_select(1, torch.as_tensor(list(views), dtype=torch.long, device=t.device))
-        )
+        return self._map(lambda t: t.index_select(1, torch.as_tensor(list(views), dtype=torch.long, device=t.device)))
 
     @classmethod
     def stack(cls, samples: Sequence[Features]) -> Features:
@@ -142,7 +159,9 @@ class Features:
         return self._map(lambda t: t.to(*args, **kwargs))
 
     def _map(self, change) -> Self:
-        return replace(self, levels={k: (change(patch), change(special)) for k, (patch, special) in self.levels.items()})
+        return replace(
+            self, levels={k: (change(patch), change(special)) for k, (patch, special) in self.levels.items()}
+        )
 
     def tensors(self) -> dict[str, Tensor]:
         """Return everything as named tensors, for a cache or a file."""

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Literal
 from torch import Tensor, nn
 
 from freegeo.errors import UserError
-from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
+from freegeo.types import Cameras, Features, ImageBatch, PhotoLike, Prediction, ViewTokens
 
 if TYPE_CHECKING:
-    from freegeo.data.photos import Photo
+    from freegeo.models.catalog import LoadedFrom
 
 Want = Literal["depth", "cameras", "rays", "points"]
 
@@ -56,9 +56,13 @@ class ReconstructionModel(nn.Module, ABC):
     """A feed-forward multi-view reconstruction model in three stages."""
 
     spec: ModelSpec
+    loaded_from: LoadedFrom | None = None
+    """Where the weights came from; None for a model that was built and not loaded."""
+    published_adapter_root: str = ""
+    """Module that adapter files of the method's authors name layers relative to; empty: the model itself."""
 
     @abstractmethod
-    def preprocess(self, photos: Sequence[Photo]) -> ImageBatch:
+    def preprocess(self, photos: Sequence[PhotoLike]) -> ImageBatch:
         """Resize and crop photos as the model was trained; UserError when a photo cannot be used."""
 
     @abstractmethod

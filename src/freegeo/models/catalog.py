@@ -77,7 +77,7 @@ def build_empty(name: str) -> ReconstructionModel:
     """Build a model on the meta device: shapes and counts, no memory."""
     from freegeo.models.checkpoints import build_on_meta
 
-    return build_on_meta(_buildable(name))  # type: ignore[return-value]
+    return build_on_meta(_buildable(name))
 
 
 def load_model(name: str = DEFAULT_MODEL, *, checkpoint: str | Path | None = None) -> ReconstructionModel:
@@ -92,7 +92,7 @@ def load_model(name: str = DEFAULT_MODEL, *, checkpoint: str | Path | None = Non
     build = _buildable(name)
     path = checkpoints.find_file(Path(checkpoint)) if checkpoint else _packaged_or_downloaded(item)
     rules = item.keys() if item.keys else checkpoints.KeyRules()
-    model: ReconstructionModel = checkpoints.build_on_meta(build)  # type: ignore[assignment]
+    model = checkpoints.build_on_meta(build)
     checkpoints.load_weights(model, path, rules, name)
     model.eval()
     model.loaded_from = LoadedFrom(

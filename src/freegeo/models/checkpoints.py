@@ -8,11 +8,14 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from freegeo.errors import UserError
+
+Model = TypeVar("Model", bound=nn.Module)
 
 _BLOCK_BYTES = 1 << 16
 _BLOCKS = 64
@@ -109,23 +112,51 @@ def load_weights(model: nn.Module, path: Path, rules: KeyRules, model_name: str)
     """Fill a model (built anywhere, also on `meta`) from a file; names and shapes must match exactly.
 
     Weights take the dtype the model was built with. UserError lists how many names are missing, unexpected or of
-    another shape, and the first of each.
+    another shape, and the first of each; or names the first tensor with a value that is not finite.
     """
     tensors = read_tensors(path)
-    source = rules.translate(list(tensors))
-    for alias, stored in rules.aliases.items():
-        if stored in source:
-            source.setdefault(alias, source[stored])
+    source = match_names(model, {name: tuple(t.shape) for name, t in tensors.items()}, path, rules, model_name)
+    _require_finite({file_name: tensors[file_name] for file_name in source.values()}, path)
     wanted = model.state_dict()
-    require_match(
-        {name: tuple(value.shape) for name, value in wanted.items()},
-        {name: tuple(tensors[file_name].shape) for name, file_name in source.items()},
-        f"{path}: this checkpoint does not fit {model_name}",
-    )
     state = {name: tensors[file_name].to(wanted[name].dtype) for name, file_name in source.items()}
     model.load_state_dict(state, assign=True)
     for parameter in model.parameters():
         parameter.requires_grad_(False)
+
+
+def _require_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
+    # The two extremes carry any NaN or infinity, and need one pass and no memory of the tensor's size.
+    damaged = [name for name, value in tensors.items() if not torch.stack(value.aminmax()).isfinite().all()]
+    if damaged:
+        raise UserError(
+            f"{path}: {len(damaged)} tensors hold values that are not finite (first: {damaged[0]}); the file is "
+            "damaged or its training diverged. Download it again."
+        )
+
+
+def match_names(
+    model: nn.Module, shapes: Mapping[str, tuple[int, ...]], path: Path, rules: KeyRules, model_name: str
+) -> dict[str, str]:
+    """Return our name -> file name for every tensor of a model; UserError unless names and shapes match exactly."""
+    source = rules.translate(list(shapes))
+    for alias, stored in rules.aliases.items():
+        if stored in source:
+            source.setdefault(alias, source[stored])
+    require_match(
+        {name: tuple(value.shape) for name, value in model.state_dict().items()},
+        {name: shapes[file_name] for name, file_name in source.items()},
+        f"{path}: this checkpoint does not fit {model_name}",
+    )
+    return source
+
+
+def require_fit(model: nn.Module, path: Path, rules: KeyRules, model_name: str) -> None:
+    """Raise UserError when a weight file does not fit a model; only the header of a safetensors file is read."""
+    if path.suffix == ".safetensors":
+        shapes = read_header(path)
+    else:
+        shapes = {name: tuple(tensor.shape) for name, tensor in read_tensors(path).items()}
+    match_names(model, shapes, path, rules, model_name)
 
 
 def require_match(wanted: Mapping[str, tuple[int, ...]], found: Mapping[str, tuple[int, ...]], what: str) -> None:
@@ -158,7 +189,7 @@ def fingerprint(path: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-def build_on_meta(build: Callable[[], nn.Module]) -> nn.Module:
+def build_on_meta(build: Callable[[], Model]) -> Model:
     """Build a model without memory, for counting or for loading by assignment."""
     with torch.device("meta"):
         return build()

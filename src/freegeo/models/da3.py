@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from torch import Tensor, nn
@@ -200,6 +200,8 @@ class CameraEncoder(nn.Module):
 class DA3(ReconstructionModel):
     """Depth Anything 3 for any number of views."""
 
+    published_adapter_root = "backbone.pretrained"
+
     def __init__(self, config: DA3Config, spec: ModelSpec):
         super().__init__()
         self.config, self.spec = config, spec
@@ -217,7 +219,7 @@ class DA3(ReconstructionModel):
 
     @property
     def _vit(self) -> Backbone:
-        return self.backbone["pretrained"]
+        return cast(Backbone, self.backbone["pretrained"])
 
     @property
     def camera_token_name(self) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -12,10 +12,7 @@ from torch import Tensor
 from freegeo.errors import UserError
 from freegeo.geometry.resample import resize_area, resize_cubic
 from freegeo.models.images import Size, to_batch
-from freegeo.types import ImageBatch
-
-if TYPE_CHECKING:
-    from freegeo.data.photos import Photo
+from freegeo.types import ImageBatch, PhotoLike
 
 Method = Literal["upper_bound_resize", "upper_bound_crop", "lower_bound_resize", "lower_bound_crop"]
 
@@ -47,7 +44,8 @@ def plan_size(photo: Size, side: int, patch: int, method: Method = "upper_bound_
         final = (bounded[0] // patch * patch, bounded[1] // patch * patch)
         final_step = "none" if final == bounded else "crop"
     else:
-        final = tuple((n + patch // 2) // patch * patch for n in bounded)
+        rows, columns = ((n + patch // 2) // patch * patch for n in bounded)
+        final = (rows, columns)
         grows = any(f > b for f, b in zip(final, bounded, strict=True))
         final_step = "none" if final == bounded else "cubic" if grows else "area"
     if min(final) < patch:
@@ -69,7 +67,9 @@ def apply_plan(pixels_HW3: Tensor, plan: SizePlan) -> Tensor:
     return pixels_HW3[top : top + plan.final[0], left : left + plan.final[1]]
 
 
-def preprocess(photos: Sequence[Photo], *, side: int, patch: int, method: Method = "upper_bound_resize") -> ImageBatch:
+def preprocess(
+    photos: Sequence[PhotoLike], *, side: int, patch: int, method: Method = "upper_bound_resize"
+) -> ImageBatch:
     """Read and resize photos; photos that end up with different sizes are centre-cropped to the smallest sides."""
     plans = [_plan_photo(photo, side, patch, method) for photo in photos]
     height, width = (min(plan.final[k] for plan in plans) for k in (0, 1))
@@ -82,7 +82,7 @@ def preprocess(photos: Sequence[Photo], *, side: int, patch: int, method: Method
     return to_batch(photos, cropped, scale_xy=[_scale_xy(plan) for plan in plans], offset_xy=offsets)
 
 
-def _plan_photo(photo: Photo, side: int, patch: int, method: Method) -> SizePlan:
+def _plan_photo(photo: PhotoLike, side: int, patch: int, method: Method) -> SizePlan:
     try:
         return plan_size(photo.size_hw, side, patch, method)
     except UserError as error:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal
 
 import torch
+from torch import nn
 
 from freegeo.errors import UserError
 
+if TYPE_CHECKING:
+    from freegeo.models.api import ReconstructionModel
+
 Precision = Literal["fp32", "bf16", "fp16"]
+PRECISIONS: tuple[Precision, ...] = ("fp32", "bf16", "fp16")
 _DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 
@@ -35,11 +40,40 @@ def choose_precision(name: str | None, device: torch.device) -> Precision:
     """Return the precision asked for, or bf16 on a CUDA device that has it, else fp32."""
     if name is None:
         return "bf16" if device.type == "cuda" and torch.cuda.is_bf16_supported() else "fp32"
-    if name not in get_args(Precision):
-        raise UserError(f"unknown precision '{name}'. Choose fp32, bf16 or fp16.")
-    return name  # type: ignore[return-value]
+    for known in PRECISIONS:
+        if name == known:
+            return known
+    raise UserError(f"unknown precision '{name}'. Choose {', '.join(PRECISIONS)}.")
 
 
 def autocast(device: torch.device, precision: Precision) -> AbstractContextManager:
     """Return the context that a model's embed and aggregate run in."""
     return nullcontext() if precision == "fp32" else torch.autocast(device.type, _DTYPES[precision])
+
+
+def cast_linears(model: ReconstructionModel, precision: Precision) -> None:
+    """Store the encoder's frozen linear and convolution weights in the half precision that autocast rounds them to.
+
+    Results under `autocast` stay the same to the bit and the weights take half the room. Norms, LayerScale, tokens,
+    trained parameters and everything outside the encoder (the heads) keep float32. Rounding is for good: reload the
+    model for float32 results. Nothing happens for `fp32`.
+    """
+    if precision == "fp32":
+        return
+    for module in encoder(model).modules():
+        if isinstance(module, nn.Linear | nn.Conv2d):
+            for parameter in module.parameters(recurse=False):
+                if not parameter.requires_grad:
+                    parameter.data = parameter.data.to(_DTYPES[precision])
+
+
+def encoder(model: ReconstructionModel) -> nn.Module:
+    """Return the innermost module that holds everything an adapter touches: `embed` and `aggregate`, but no head."""
+    names = [*model.adapter_targets(), *([model.camera_token_name] if model.camera_token_name else [])]
+    paths = [name.split(".")[:-1] for name in names]
+    common = []
+    for parts in zip(*paths, strict=False):
+        if len(set(parts)) > 1:
+            break
+        common.append(parts[0])
+    return model.get_submodule(".".join(common))

@@ -28,7 +28,8 @@ def saddle_balanced(token_BSD: Tensor) -> Tensor:
     unit_BSD = token_BSD / norm_BS[..., None]
     similarity_BS = _similarity(unit_BSD).sum(-1) / (token_BSD.shape[1] - 1)
     metrics = (similarity_BS, norm_BS, unit_BSD.var(dim=-1))
-    return sum((_min_max(m) - 0.5).abs() for m in metrics).argmin(1)
+    by_similarity, by_norm, by_spread = ((_min_max(m) - 0.5).abs() for m in metrics)
+    return (by_similarity + by_norm + by_spread).argmin(1)
 
 
 def saddle_sim_range(token_BSD: Tensor) -> Tensor:

@@ -148,7 +148,7 @@ class Block(nn.Module):
         return x_BLD + self.ls2(self.mlp(self.norm2(x_BLD)))
 
 
-def run_block(block: Block, x_BLD: Tensor, rope: Rope | None, *, recompute: bool) -> Tensor:
+def run_block(block: nn.Module, x_BLD: Tensor, rope: Rope | None, *, recompute: bool) -> Tensor:
     """Run a block, keeping only its input for the backward pass when `recompute` is on."""
     if recompute and torch.is_grad_enabled():
         return checkpoint(block, x_BLD, rope, use_reentrant=False)
@@ -194,7 +194,7 @@ def first_and_others(tokens_12X: Tensor, batch: int, views: int) -> Tensor:
     return per_view.expand(batch, *per_view.shape[1:])
 
 
-def block_linears(prefix: str, block: Block) -> list[str]:
+def block_linears(prefix: str, block: nn.Module) -> list[str]:
     """Return the names of the four linears of a block that an adapter may sit on."""
     return [f"{prefix}.{name}" for name, module in block.named_modules() if isinstance(module, nn.Linear)]
 

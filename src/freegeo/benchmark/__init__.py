@@ -1,0 +1,1 @@
+"""The published evaluation: pure metrics, frame sampling, scoring of stored predictions."""

@@ -1,0 +1,88 @@
+"""`freegeo adapt`: train an adapter on one or several scenes and save it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from freegeo.cli import console
+from freegeo.cli.jobs import progress_hooks
+from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
+from freegeo.cli.sources import load_source, split_scenes
+
+if TYPE_CHECKING:
+    from freegeo.adaptation.bank import SceneImages
+    from freegeo.adaptation.recipe import Recipe
+    from freegeo.models.api import ReconstructionModel
+
+DEFAULT_RECIPE, DEFAULT_MODEL, DEFAULT_PHOTOS = RecipeOptions(), ModelOptions(), PhotoOptions()
+FILES = {
+    "adapter_config.json": "peft's settings",
+    "adapter_model.safetensors": "LoRA weights",
+    "camera_token.safetensors": "adapted camera token",
+    "freegeo.json": "base model, recipe, seed, scenes, loss curve",
+    "epochs": "the adapter after every epoch",
+}
+
+
+def adapt(
+    *sources: str,
+    output: OutputOptions,
+    model: ModelOptions = DEFAULT_MODEL,
+    recipe: RecipeOptions = DEFAULT_RECIPE,
+    photos: PhotoOptions = DEFAULT_PHOTOS,
+) -> None:
+    """Adapt a model to scenes; several folders make one adapter for all of them.
+
+    Parameters
+    ----------
+    sources
+        Folders of photos (each a scene), globs in quotes, photo files (together one scene), or `demo`.
+    """
+    from freegeo.adaptation.bank import SceneImages
+    from freegeo.pipeline import require_enough_photos, settings_of
+    from freegeo.storage import check_folder, run_folder
+
+    scenes = {str(part[0]): load_source(part, photos.max_views) for part in split_scenes(sources or ("",))}
+    for found in scenes.values():
+        require_enough_photos(found)
+    loaded = model.load()
+    plan = recipe.build(loaded.spec)
+    names = {name: [photo.name for photo in found] for name, found in scenes.items()}
+    settings = settings_of(plan, command="adapt", scenes=names, **model.settings(loaded))
+    check_folder(output.output, settings, overwrite=output.overwrite)
+    images = [SceneImages.from_batch(name, loaded.preprocess(found)) for name, found in scenes.items()]
+    with run_folder(output.output, settings, overwrite=output.overwrite) as folder:
+        if folder.finished:
+            console.say(f"{output.output}: already finished on {folder.finished_at}; nothing to do.")
+            return
+        _train(loaded, images, plan, model, folder.path)
+        folder.finish()
+    console.written(output.output, FILES)
+
+
+def _train(
+    loaded: ReconstructionModel, images: list[SceneImages], plan: Recipe, model: ModelOptions, folder: Path
+) -> None:
+    from freegeo.adaptation.adapter_files import save_adapter
+    from freegeo.adaptation.trainer import STATE_FILE
+    from freegeo.adaptation.trainer import adapt as train_adapter
+    from freegeo.pipeline import loss_change
+
+    names = [scene.name for scene in images]
+
+    def keep_epoch(epoch: int, adapter) -> None:
+        if plan.epochs is not None:
+            page = {"epoch": epoch, "scenes": names, "seed": model.seed}
+            save_adapter(adapter, folder / "epochs" / f"epoch_{epoch}", page)
+
+    with progress_hooks() as hooks:
+        result = train_adapter(
+            loaded, images, plan, seed=model.seed, engine=model.engine(), resume_in=folder, on_step=hooks.step,
+            on_epoch=keep_epoch,
+        )  # fmt: skip
+    save_adapter(result.adapter, folder, result.page(names))
+    (folder / STATE_FILE).unlink(missing_ok=True)
+    change = loss_change([terms["total"] for terms in result.curve])
+    console.say(f"adaptation loss {change['first']:.4f} -> {change['last']:.4f} in {result.seconds:.0f} s")
+    console.say(f"licence of the weights: {loaded.spec.weights_licence}")

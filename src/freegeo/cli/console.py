@@ -1,0 +1,110 @@
+"""What the commands say: messages, progress with time left, and a summary of what was written."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+
+def configure_logging(verbose: bool) -> None:
+    """Send the library's messages to stderr: notes by default, everything with -v."""
+    logger = logging.getLogger("freegeo")
+    logger.handlers.clear()
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG if verbose else logging.INFO)
+    logger.propagate = False
+
+
+def say(text: str = "") -> None:
+    """Print a line of a command's result."""
+    print(text, flush=True)
+
+
+def note(text: str) -> None:
+    """Print a line about what is going on, to stderr."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def fail(sentence: str, code: int) -> int:
+    """Print why a command stopped and return its exit code."""
+    note(f"freegeo: {sentence}")
+    return code
+
+
+@contextmanager
+def progress_bar(title: str, total: int) -> Generator[Any]:
+    """Show a bar with time left on a terminal, a line every tenth elsewhere; gives `update(done, text)`."""
+    if not sys.stderr.isatty():
+        yield _lines(title, total)
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(), TextColumn("{task.fields[text]}"),
+    )  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(title, total=total, text="")
+        yield lambda done, text="": bar.update(task, completed=done, text=text)
+
+
+def _lines(title: str, total: int):
+    import time
+
+    started, shown = time.monotonic(), -1
+
+    def update(done: int, text: str = "") -> None:
+        nonlocal shown
+        tenth = done * 10 // total
+        if tenth > shown:
+            shown = tenth
+            left = (time.monotonic() - started) * (total - done) / max(done, 1)
+            note(f"{title}: {done}/{total}, {left:.0f} s left{', ' + text if text else ''}")
+
+    return update
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Lay out a plain table: first column to the left, the others to the right."""
+    cells = [list(header), *(list(row) for row in rows)]
+    widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
+    lines = ["  ".join(c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True)))
+             for row in cells]  # fmt: skip
+    return "\n".join([lines[0], "  ".join("-" * w for w in widths), *lines[1:]])
+
+
+def written(folder: Path, files: Mapping[str, str]) -> None:
+    """List the files of a result that are there, with what each is for."""
+    rows = []
+    for name, about in files.items():
+        path = folder / name
+        if path.exists():
+            rows.append((str(path), size(path), about))
+    say(f"\nWritten to {folder}:")
+    width = max((len(row[0]) for row in rows), default=0)
+    for path, amount, about in rows:
+        say(f"  {path.ljust(width)}  {amount:>9}  {about}")
+
+
+def size(path: Path) -> str:
+    """Return the size of a file or folder for people."""
+    total = sum(p.stat().st_size for p in path.rglob("*") if p.is_file()) if path.is_dir() else path.stat().st_size
+    for unit in ("B", "kB", "MB"):
+        if total < 1000:
+            return f"{total:.0f} {unit}" if unit == "B" else f"{total:.1f} {unit}"
+        total /= 1000
+    return f"{total:.1f} GB"

@@ -1,0 +1,100 @@
+"""`freegeo models`: what there is, what it costs, and whether a file fits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cyclopts import App
+
+from freegeo.cli import console
+from freegeo.models import catalog
+
+app = App(name="models", help="List, describe, download and check models.", help_format="plaintext")
+RANKS = (8, 16, 32, 64)
+
+
+@app.default
+def list_models() -> None:
+    """List all models."""
+    rows = [_row(name) for name in catalog.names()]
+    console.say(console.table(("model", "parameters", "licence of the weights", "about"), rows))
+
+
+def _row(name: str) -> tuple[str, str, str, str]:
+    item = catalog.entry(name)
+    about = item.about if item.build else f"not implemented yet: {item.about}"
+    parameters = item.parameters or parameter_count(name)
+    return name, f"{parameters / 1e6:,.1f} M", item.licence, about
+
+
+def parameter_count(name: str) -> int:
+    """Count the parameters of a model built without memory."""
+    return sum(parameter.numel() for parameter in catalog.build_empty(name).parameters())
+
+
+@app.command
+def describe(model: str) -> None:
+    """Say what a model is, where its weights come from, and what an adapter of it trains.
+
+    Parameters
+    ----------
+    model
+        Catalog name.
+    """
+    from freegeo.adaptation.adapter import count_trainable
+
+    item = catalog.entry(model)
+    console.say(f"{item.name}: {item.about}")
+    console.say(f"licence of the weights: {item.licence}")
+    console.say(f"weights: {item.hub_id or item.packaged_weights or 'local file (--checkpoint)'}")
+    if item.build is None:
+        console.say("not implemented yet")
+        return
+    built = catalog.build_empty(model)
+    total = sum(parameter.numel() for parameter in built.parameters())
+    spec = built.spec
+    console.say(
+        f"parameters: {total:,} ({total * 4 / 1e9:.2f} GB in float32, {total * 2 / 1e9:.2f} GB in half precision)"
+    )
+    console.say(f"images: longest side {spec.default_side}, patches of {spec.patch_size}")
+    console.say(
+        f"reference view: {spec.reference}; features compared at layers {', '.join(map(str, spec.loss_layers))}"
+    )
+    console.say(f"adapter: {len(built.adaptable().adapter_targets())} linear layers and the camera token")
+    console.say(
+        console.table(("rank", "trainable parameters"), [(str(r), f"{count_trainable(built, r):,}") for r in RANKS])
+    )
+
+
+@app.command
+def download(model: str) -> None:
+    """Download a model's weights from the hub; an interrupted download continues.
+
+    Parameters
+    ----------
+    model
+        Catalog name.
+    """
+    item = catalog.entry(model)
+    console.say(f"licence of the weights: {item.licence}")
+    console.say(str(catalog.download(model)))
+
+
+@app.command
+def check(model: str, checkpoint: Path) -> None:
+    """Check that a local weight file fits a model, without loading it into memory where the format allows.
+
+    Parameters
+    ----------
+    model
+        Catalog name.
+    checkpoint
+        File or folder.
+    """
+    from freegeo.models import checkpoints
+
+    path = checkpoints.find_file(checkpoint)
+    item = catalog.entry(model)
+    rules = item.keys() if item.keys else checkpoints.KeyRules()
+    checkpoints.require_fit(catalog.build_empty(model), path, rules, model)
+    console.say(f"{path}: fits {model} (fingerprint {checkpoints.fingerprint(path)})")

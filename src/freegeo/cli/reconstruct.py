@@ -1,0 +1,32 @@
+"""`freegeo reconstruct`: a frozen model or a saved adapter, no training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from freegeo.cli.jobs import run_job
+from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions
+from freegeo.cli.sources import load_source
+
+DEFAULT_MODEL, DEFAULT_PHOTOS = ModelOptions(), PhotoOptions()
+
+
+def reconstruct(
+    *sources: str,
+    output: OutputOptions,
+    model: ModelOptions = DEFAULT_MODEL,
+    photos: PhotoOptions = DEFAULT_PHOTOS,
+    adapter: Path | None = None,
+) -> None:
+    """Reconstruct photos; one photo is enough.
+
+    Parameters
+    ----------
+    sources
+        A folder of photos, a glob in quotes, photo files, or `demo` (a generated room).
+    adapter
+        Folder of a saved adapter; without it the frozen model is used.
+    """
+    found = load_source(sources, photos.max_views)
+    loaded = model.load()
+    run_job(found, loaded, model, output, command="reconstruct", recipe=None, adapter=adapter)

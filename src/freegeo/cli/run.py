@@ -1,0 +1,34 @@
+"""`freegeo run`: photos in, adapted reconstruction out."""
+
+from __future__ import annotations
+
+from freegeo.cli.jobs import run_job
+from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
+from freegeo.cli.sources import load_source
+
+DEFAULT_RECIPE, DEFAULT_MODEL, DEFAULT_PHOTOS = RecipeOptions(), ModelOptions(), PhotoOptions()
+
+
+def run(
+    *sources: str,
+    output: OutputOptions,
+    model: ModelOptions = DEFAULT_MODEL,
+    recipe: RecipeOptions = DEFAULT_RECIPE,
+    photos: PhotoOptions = DEFAULT_PHOTOS,
+    adapt: bool = True,
+) -> None:
+    """Reconstruct photos with a model adapted to them.
+
+    The same command continues an unfinished run.
+
+    Parameters
+    ----------
+    sources
+        A folder of photos, a glob in quotes, photo files, or `demo` (a generated room).
+    adapt
+        Adapt before reconstructing; --no-adapt uses the frozen model.
+    """
+    found = load_source(sources, photos.max_views)
+    loaded = model.load()
+    plan = recipe.build(loaded.spec) if adapt else None
+    run_job(found, loaded, model, output, command="run", recipe=plan)

@@ -1,0 +1,43 @@
+"""What SOURCE may be: a folder of photos, a glob, photo files, or `demo`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from freegeo.errors import UserError
+
+if TYPE_CHECKING:
+    from freegeo.data.scene import Scene
+    from freegeo.types import PhotoLike
+
+DEMO = "demo"
+DEMO_DOMAIN = "light"
+DEMO_FRAMES = 16
+
+
+def load_source(sources: Sequence[str], max_views: int) -> list[PhotoLike]:
+    """Return the photos of one scene: several files are one scene, in the order given."""
+    from freegeo.data.photos import load_photos
+
+    if not sources:
+        raise UserError("no source given: name a folder of photos, a glob, or photo files.")
+    if list(sources) == [DEMO]:
+        return list(demo_scene(0, DEMO_DOMAIN).photos)[:max_views]
+    return list(load_photos(sources[0] if len(sources) == 1 else list(sources), max_views))
+
+
+def demo_scene(room: int, domain: str) -> Scene:
+    """Photograph a generated room of a test domain."""
+    from freegeo.data.procedural import get_domain, photograph_room
+
+    seed = next(iter(get_domain(domain).seeds(1, start=room)))
+    return photograph_room(seed, domain, frames=DEMO_FRAMES)
+
+
+def split_scenes(sources: Sequence[str]) -> list[list[str]]:
+    """Tell scenes apart: photo files together are one scene, every folder or pattern is one of its own."""
+    if all(Path(source).is_file() for source in sources):
+        return [list(sources)]
+    return [[source] for source in sources]

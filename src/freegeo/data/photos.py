@@ -1,0 +1,176 @@
+"""A user's photos: a folder, a glob or a list of files, in natural order, upright, as 8-bit RGB."""
+
+from __future__ import annotations
+
+import glob
+import logging
+import re
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from freegeo.errors import UserError
+
+logger = logging.getLogger(__name__)
+
+PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff"})
+HEIF_SUFFIXES = frozenset({".heic", ".heif"})
+MAX_PIXELS = 150_000_000
+"""Largest photo that is read; beyond it a decoded photo takes more than half a gigabyte."""
+MAX_VIEWS = 32
+_SYSTEM_FILES = frozenset({"thumbs.db", "desktop.ini"})
+_ORIENTATION_TAG = 0x0112
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One photo on disk; pixels are decoded at each `read`."""
+
+    name: str
+    path: Path
+    size_hw: tuple[int, int]
+    """Height and width after EXIF rotation."""
+
+    def read(self) -> np.ndarray:
+        """Decode to upright RGB (H, W, 3) uint8; transparent pixels become white."""
+        from PIL import ImageOps
+
+        with _opened(self.path) as image:
+            return np.array(_to_rgb(ImageOps.exif_transpose(image)))
+
+
+def load_photos(source: str | Path | Sequence[str | Path], max_views: int = MAX_VIEWS) -> list[Photo]:
+    """Find the photos of a source and keep at most `max_views` of them, evenly spaced in natural name order.
+
+    `source` is a folder, a glob pattern, or a list of files. UserError says which file is missing, unreadable, no
+    photo, or larger than `MAX_PIXELS`.
+    """
+    if max_views < 1:
+        raise UserError(f"--max-views must be at least 1, got {max_views}.")
+    paths = find_photos(source)
+    if len(paths) > max_views:
+        logger.info("%d photos found, %d kept, evenly spaced (--max-views)", len(paths), max_views)
+        paths = [paths[i] for i in evenly_spaced(len(paths), max_views)]
+    names = unique_names(paths)
+    return [Photo(name, path, _size_hw(path)) for name, path in zip(names, paths, strict=True)]
+
+
+def evenly_spaced(count: int, keep: int) -> list[int]:
+    """Return `keep` distinct indices of `range(count)`, first and last included (the first alone for keep = 1)."""
+    return [round(i) for i in np.linspace(0, count - 1, min(count, keep))]
+
+
+def find_photos(source: str | Path | Sequence[str | Path]) -> list[Path]:
+    """List the photo files of a source; a list keeps its order, a folder or glob is sorted naturally."""
+    if not isinstance(source, str | Path):
+        return [_checked_file(Path(path)) for path in source] or _no_photos("the list of photos")
+    folder = Path(source)
+    if folder.is_dir():
+        return _folder_photos(folder)
+    if folder.is_file():
+        return [_checked_file(folder)]
+    if glob.has_magic(str(source)):
+        matches = [Path(path) for path in glob.glob(str(source), recursive=True)]  # noqa: PTH207 (absolute patterns too)
+        return sorted((_checked_file(p) for p in matches if p.is_file()), key=natural_key) or _no_photos(str(source))
+    raise UserError(f"{source}: no such folder, file or pattern. Give a folder of photos, a glob or a photo.")
+
+
+def natural_key(path: Path) -> list[tuple[int, int | str]]:
+    """Sort key that puts frame2 before frame10."""
+    return [(0, int(part)) if part.isdigit() else (1, part.lower()) for part in re.split(r"(\d+)", str(path)) if part]
+
+
+def unique_names(paths: Sequence[Path]) -> list[str]:
+    """Return file names, with as many parent folders as it takes to tell all of them apart."""
+    for depth in range(1, max((len(p.parts) for p in paths), default=1) + 1):
+        names = ["/".join(path.parts[-depth:]) for path in paths]
+        if len(set(names)) == len(names):
+            return names
+    twice = next(str(p) for i, p in enumerate(paths) if p in paths[:i])
+    raise UserError(f"{twice} is listed twice. Name each photo once.")
+
+
+def _no_photos(where: str) -> list[Path]:
+    raise UserError(f"{where}: no photos found. Supported are {_supported()}.")
+
+
+def _supported() -> str:
+    return "JPEG, PNG, WebP and TIFF (HEIC with pip install 'freegeo[heif]')"
+
+
+def _folder_photos(folder: Path) -> list[Path]:
+    files = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")]
+    files = sorted((p for p in files if p.name.lower() not in _SYSTEM_FILES), key=natural_key)
+    strangers = [p for p in files if p.suffix.lower() not in PHOTO_SUFFIXES | HEIF_SUFFIXES]
+    if strangers and len(strangers) < len(files):
+        raise UserError(
+            f"{folder}: {len(strangers)} of {len(files)} files are no photos (first: {strangers[0].name}). "
+            f"Move them away, or choose the photos with a pattern such as '{folder}/*{_photo_suffix(files)}'."
+        )
+    return [p for p in files if p not in strangers] or _no_photos(str(folder))
+
+
+def _photo_suffix(files: Sequence[Path]) -> str:
+    return next(p.suffix for p in files if p.suffix.lower() in PHOTO_SUFFIXES | HEIF_SUFFIXES)
+
+
+def _checked_file(path: Path) -> Path:
+    if not path.is_file():
+        raise UserError(f"{path}: no such file.")
+    if path.suffix.lower() not in PHOTO_SUFFIXES | HEIF_SUFFIXES:
+        raise UserError(f"{path}: not a photo. Supported are {_supported()}.")
+    return path
+
+
+@contextmanager
+def _opened(path: Path) -> Generator:
+    from PIL import Image, UnidentifiedImageError
+
+    if path.suffix.lower() in HEIF_SUFFIXES:
+        _register_heif(path)
+    try:
+        with Image.open(path) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise UserError(
+                    f"{path}: {image.width} x {image.height} pixels are more than the limit of "
+                    f"{MAX_PIXELS // 1_000_000} megapixels. Shrink the photo first."
+                )
+            yield image
+    except UnidentifiedImageError:
+        raise UserError(f"{path}: the file is not a readable image. Replace it or take it out.") from None
+    except Image.DecompressionBombError as error:
+        raise UserError(f"{path}: {error} Shrink the photo first.") from None
+    except (OSError, SyntaxError) as error:
+        raise UserError(f"{path}: the image is damaged or truncated ({error}). Replace it or take it out.") from None
+
+
+def _register_heif(path: Path) -> None:
+    try:
+        import pillow_heif
+    except ImportError:
+        raise UserError(f"{path}: HEIC photos need an extra: pip install 'freegeo[heif]'.") from None
+    pillow_heif.register_heif_opener()
+
+
+def _size_hw(path: Path) -> tuple[int, int]:
+    with _opened(path) as image:
+        turned = image.getexif().get(_ORIENTATION_TAG, 1) >= 5
+        return (image.width, image.height) if turned else (image.height, image.width)
+
+
+def _to_rgb(image):
+    from PIL import Image
+
+    if image.mode in ("I;16", "I;16B", "I;16L", "I"):
+        # Pillow clips 16-bit values when it converts them; photos need them scaled.
+        return Image.fromarray(
+            (np.asarray(image, dtype=np.float64) / 257).round().clip(0, 255).astype(np.uint8)
+        ).convert("RGB")
+    if "A" in image.getbands() or "transparency" in image.info:
+        image = image.convert("RGBA")
+        white = Image.new("RGBA", image.size, "white")
+        return Image.alpha_composite(white, image).convert("RGB")
+    return image.convert("RGB")

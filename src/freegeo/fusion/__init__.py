@@ -1,0 +1,1 @@
+"""From depth maps with cameras to surfaces and points."""

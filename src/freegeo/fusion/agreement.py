@@ -1,0 +1,195 @@
+"""What the other views say about each pixel's depth: how many agree with it, and how many contradict it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from freegeo.geometry.reproject import reproject
+from freegeo.geometry.se3 import camera_centres
+
+__all__ = [
+    "Lookup",
+    "Surfaces",
+    "Votes",
+    "look_up",
+    "nearest_views",
+    "prepare",
+    "relative_slope",
+    "tolerance_of",
+    "vote",
+]
+
+MAX_NEIGHBOURS = 6
+"""Other views that are asked about a view's pixels."""
+TOLERANCE_RANGE = (0.02, 0.15)
+"""Range of the tolerance that is read off the data."""
+_QUANTILE, _SPREAD = 0.25, 8.0
+_TOLERANCE_NEIGHBOURS = 2
+_LARGEST_SLOPE = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Votes:
+    """Votes on every pixel, (S, H, W) int16; views whose image a pixel's point is outside of do not vote."""
+
+    agree: Tensor
+    """Other views whose surface lies where this pixel's does."""
+    contradict: Tensor
+    """Other views that see through this pixel's surface, or whose surface this pixel sees through."""
+    asked: Tensor
+    """Other views whose image the pixel's point falls into."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surfaces:
+    """The usable pixels of S views, prepared for `look_up`."""
+
+    depth_z: Tensor
+    """(S, H, W); NaN where not usable."""
+    T_cam_world: Tensor
+    """(S, 4, 4)."""
+    K: Tensor
+    """(S, 3, 3)."""
+    allowed: Tensor
+    """(S, H, W) relative depth difference that counts as the same surface: the tolerance and the slope."""
+    barrier: Tensor
+    """(S, H + 1, W + 1) depth before which a point between four pixels floats in front of all of their surfaces."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lookup:
+    """One view's pixels compared with the depth map of another."""
+
+    asked: Tensor
+    """(H, W) bool: usable, and inside the target's image."""
+    agrees: Tensor
+    """(H, W) bool: the nearest target pixel has the expected depth."""
+    sees_through: Tensor
+    """(H, W) bool: the target pixels around the projection (up to four) are all farther than expected."""
+    nearest: Tensor
+    """(H, W) int64: flat index of the nearest target pixel; meaningless where not asked."""
+    pixel: Tensor
+    """(H, W, 2) column and row of the projection in the target; meaningless where not asked."""
+    difference: Tensor
+    """(H, W) measured / expected - 1 at the nearest target pixel; NaN where not asked or not usable there."""
+
+
+def prepare(depth_z: Tensor, T_cam_world: Tensor, K: Tensor, usable: Tensor, *, tolerance: float) -> Surfaces:
+    """Prepare depth maps (S, H, W) for comparisons with a relative `tolerance`; only `usable` pixels take part."""
+    known = torch.where(usable, depth_z, torch.nan)
+    allowed = tolerance + relative_slope(known)
+    front = torch.nn.functional.pad((known / (1 + allowed)).nan_to_num(torch.inf), (1, 1, 1, 1), value=torch.inf)
+    barrier = -torch.nn.functional.max_pool2d(-front[:, None], 2, stride=1)[:, 0]
+    # Where none of the four pixels is usable, nothing is known, so nothing is contradicted.
+    return Surfaces(
+        depth_z=known,
+        T_cam_world=T_cam_world,
+        K=K,
+        allowed=allowed,
+        barrier=torch.where(barrier.isinf(), 0.0, barrier),
+    )
+
+
+def vote(surfaces: Surfaces, neighbours: Tensor | None = None) -> Votes:
+    """Let the views vote on each other's usable pixels.
+
+    A pixel's point is carried into another view. If that view has a surface there, it agrees; if it sees farther, one
+    of the two pixels is wrong, and both get a contradiction; if it sees something nearer, the point is hidden, which
+    says nothing. `neighbours` (S, n) are the views to ask, by default `nearest_views`.
+    """
+    if neighbours is None:
+        neighbours = nearest_views(surfaces.T_cam_world)
+    depth_z = surfaces.depth_z
+    agree = torch.zeros(depth_z.shape, dtype=torch.int16, device=depth_z.device)
+    contradict, asked = torch.zeros_like(agree), torch.zeros_like(agree)
+    for source, others in enumerate(neighbours.tolist()):
+        for target in others:
+            seen = look_up(surfaces, source, target)
+            asked[source] += seen.asked
+            agree[source] += seen.agrees
+            contradict[source] += seen.sees_through
+            # One vote per pair of views and pixel, however many points land on it.
+            hit = torch.zeros(depth_z[0].numel(), dtype=torch.bool, device=depth_z.device)
+            hit[seen.nearest[seen.sees_through]] = True
+            contradict[target] += hit.view(depth_z.shape[1:])
+    return Votes(agree=agree, contradict=contradict, asked=asked)
+
+
+def look_up(surfaces: Surfaces, source: int, target: int) -> Lookup:
+    """Compare the usable pixels of view `source` with the depth of view `target`."""
+    height, width = surfaces.depth_z.shape[1:]
+    there = reproject(
+        surfaces.depth_z[source],
+        K_source=surfaces.K[source],
+        T_source_world=surfaces.T_cam_world[source],
+        K_target=surfaces.K[target],
+        T_target_world=surfaces.T_cam_world[target],
+        target_hw=(height, width),
+    )
+    asked = there.in_view
+    pixel = torch.where(asked[..., None], there.pixel, 0.0)
+    column, row = (pixel + 0.5).floor().long().unbind(-1)
+    nearest = row * width + column
+    difference = surfaces.depth_z[target].flatten()[nearest] / there.depth_z - 1
+    difference = torch.where(asked, difference, torch.nan)
+    # The barrier between the pixels (u, v) and (u + 1, v + 1) has the index (u + 1, v + 1).
+    after = (pixel.floor() + 1).long()
+    barrier = surfaces.barrier[target].flatten()[after[..., 1] * (width + 1) + after[..., 0]]
+    return Lookup(
+        asked=asked,
+        agrees=difference.abs() <= surfaces.allowed[target].flatten()[nearest],  # false for NaN
+        sees_through=asked & (there.depth_z < barrier),
+        nearest=nearest,
+        pixel=pixel,
+        difference=difference,
+    )
+
+
+def relative_slope(depth_z: Tensor) -> Tensor:
+    """Relative depth change (S, H, W) to the next pixel, at most 0.2: the flatter side of each axis, both axes added.
+
+    `depth_z` (S, H, W) holds NaN where it is not known; the slope is 0 there.
+    """
+    total = torch.zeros_like(depth_z)
+    for dim in (-1, -2):
+        step = depth_z.diff(dim=dim).abs().nan_to_num(torch.inf)
+        edge = torch.full_like(depth_z.narrow(dim, 0, 1), torch.inf)
+        total += torch.minimum(torch.cat((edge, step), dim), torch.cat((step, edge), dim)) / depth_z
+    return total.clamp(max=_LARGEST_SLOPE).nan_to_num(0.0)
+
+
+def nearest_views(T_cam_world: Tensor, count: int = MAX_NEIGHBOURS) -> Tensor:
+    """Indices (S, min(count, S - 1)) of the views most like each view: distance of centres and angle between axes.
+
+    Distances count in units of the median distance, angles in units of 45 degrees.
+    """
+    centres, axes = camera_centres(T_cam_world), T_cam_world[..., 2, :3]
+    distance = torch.linalg.vector_norm(centres[:, None] - centres[None], dim=-1)
+    angle = torch.arccos((axes @ axes.mT).clamp(-1, 1))
+    unlike = distance / distance.median().clamp(min=1e-8) + angle / (torch.pi / 4)
+    unlike.fill_diagonal_(torch.inf)
+    return unlike.argsort(dim=-1, stable=True)[:, : min(count, len(T_cam_world) - 1)]
+
+
+def tolerance_of(depth_z: Tensor, T_cam_world: Tensor, K: Tensor, usable: Tensor) -> float:
+    """Tolerance for `prepare` that fits how well these maps agree: 0.02 to 0.15.
+
+    It is 8 times the lower quartile of the relative differences between each view and its two nearest (2.5 standard
+    deviations of normal noise); hidden points differ more, so the median would overestimate. Exact depth gets the
+    lower bound; a network whose views disagree by some per cent is not filtered to nothing.
+    """
+    surfaces = prepare(depth_z, T_cam_world, K, usable, tolerance=0.0)
+    found = []
+    for source, others in enumerate(nearest_views(T_cam_world, _TOLERANCE_NEIGHBOURS).tolist()):
+        for target in others:
+            difference = look_up(surfaces, source, target).difference.abs()
+            found.append(difference[~difference.isnan()])
+    differences = torch.cat(found) if found else depth_z.new_zeros(0)
+    if differences.numel() == 0:
+        return TOLERANCE_RANGE[0]
+    low, high = TOLERANCE_RANGE
+    return min(max(_SPREAD * float(np.quantile(differences.cpu().numpy(), _QUANTILE)), low), high)

@@ -1,0 +1,194 @@
+"""Which pixels of a reconstruction to believe."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from freegeo.errors import UserError
+from freegeo.fusion.agreement import prepare, tolerance_of, vote
+from freegeo.geometry.depth import valid_depth
+
+__all__ = ["FilterReport", "FilterSettings", "confident_pixels", "filter_pixels", "flying_pixels"]
+
+CONTINUATION_TOLERANCE = 0.03
+"""Largest relative distance of a pixel from the straight continuation of its neighbours."""
+SMALL_STEP = 0.015
+"""Relative step to the next pixel that shows a surface without asking for a straight line."""
+STEEPEST_SLOPE = 12.0
+"""Tangent of the steepest angle (85 degrees) between a surface and the image plane that is believed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterSettings:
+    """Which filters run, and how strictly."""
+
+    drop_share: float = 0.4
+    """Least confident share of the pixels to remove, 0 to below 1; 0 switches the filter off."""
+    flying: bool = True
+    """Remove pixels between surfaces."""
+    multi_view: bool = True
+    """Remove pixels that more views contradict than confirm."""
+    min_agreeing: int = 0
+    """Other views that must agree with a pixel. 0 keeps what one view alone sees; more makes sparse, sure clouds."""
+    min_asked: int = 1
+    """`min_agreeing` is asked only of pixels whose point falls into this many other images; 0: of all pixels."""
+    tolerance: float | None = None
+    """Relative depth difference of one surface in two views; None reads it off the data."""
+    sky_limit: float = 0.5
+    """Remove pixels with at least this much sky, where the model gives it; above 1 switches the filter off."""
+
+    def __post_init__(self) -> None:
+        """Raise UserError for values outside their ranges."""
+        if not 0 <= self.drop_share < 1:
+            raise UserError(f"The share of points to drop must be from 0 to below 1, got {self.drop_share}.")
+        if self.tolerance is not None and not self.tolerance > 0:
+            raise UserError(f"The depth tolerance between views must be positive, got {self.tolerance}.")
+        if self.min_agreeing < 0 or self.min_asked < 0:
+            raise UserError(f"Views must be counted from 0, got {self.min_agreeing} and {self.min_asked}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterReport:
+    """How many pixels each filter removed of those that were left, in the order the filters ran."""
+
+    pixels: int
+    removed: Mapping[str, int]
+    """Of `invalid depth`, `mask`, `sky`, `confidence`, `flying`, `multi-view`: those that ran."""
+    tolerance: float | None
+    """Relative depth tolerance of the multi-view filter; None when it did not run."""
+
+    @property
+    def kept(self) -> int:
+        """Number of pixels that passed."""
+        return self.pixels - sum(self.removed.values())
+
+    def summary(self) -> str:
+        """One line, such as "kept 60.1 % of 983040 pixels; removed: confidence 40.0 %, flying 1.2 %"."""
+        parts = [f"{name} {100 * count / max(1, self.pixels):.1f} %" for name, count in self.removed.items() if count]
+        kept = f"kept {100 * self.kept / max(1, self.pixels):.1f} % of {self.pixels} pixels"
+        return f"{kept}; removed: {', '.join(parts)}" if parts else kept
+
+
+def filter_pixels(
+    depth_z: np.ndarray,
+    conf: np.ndarray,
+    T_cam_world: np.ndarray,
+    K: np.ndarray,
+    *,
+    sky: np.ndarray | None = None,
+    masks: np.ndarray | None = None,
+    settings: FilterSettings | None = None,
+) -> tuple[np.ndarray, FilterReport]:
+    """Decide which pixels to believe.
+
+    Args:
+        depth_z: (S, H, W).
+        conf: (S, H, W), higher is better.
+        T_cam_world: (S, 4, 4).
+        K: (S, 3, 3) pixels of the maps.
+        sky: (S, H, W), or None when the model does not give it.
+        masks: (S, H, W) bool, true where the user wants points; None: everywhere.
+        settings: default `FilterSettings()`.
+
+    Returns:
+        `keep` (S, H, W) bool, and what was removed.
+
+    Raises:
+        UserError: masks of another shape.
+    """
+    settings = settings or FilterSettings()
+    depth, T, intrinsics = (torch.from_numpy(np.ascontiguousarray(a)).float() for a in (depth_z, T_cam_world, K))
+    if masks is not None and masks.shape != depth_z.shape:
+        raise UserError(f"Masks of the shape {masks.shape} do not fit depth maps of the shape {depth_z.shape}.")
+    keep = torch.ones(depth.shape, dtype=torch.bool)
+    removed: dict[str, int] = {}
+
+    def apply(name: str, passed: Tensor) -> None:
+        nonlocal keep
+        before = int(keep.sum())
+        keep = keep & passed
+        removed[name] = before - int(keep.sum())
+
+    apply("invalid depth", valid_depth(depth))
+    if masks is not None:
+        apply("mask", torch.from_numpy(np.ascontiguousarray(masks)).bool())
+    if sky is not None and settings.sky_limit <= 1:
+        apply("sky", torch.from_numpy(np.ascontiguousarray(sky)) < settings.sky_limit)
+    if settings.drop_share > 0:
+        confidence = torch.from_numpy(np.ascontiguousarray(conf))
+        apply("confidence", confident_pixels(confidence, keep, drop_share=settings.drop_share))
+    if settings.flying:
+        apply("flying", ~flying_pixels(depth, intrinsics))
+    tolerance = None
+    if settings.multi_view and len(depth) > 1:
+        tolerance = settings.tolerance or tolerance_of(depth, T, intrinsics, keep)
+        apply("multi-view", _confirmed(depth, T, intrinsics, keep, tolerance, settings))
+    return keep.numpy(), FilterReport(pixels=depth.numel(), removed=removed, tolerance=tolerance)
+
+
+def _confirmed(
+    depth_z: Tensor, T_cam_world: Tensor, K: Tensor, usable: Tensor, tolerance: float, settings: FilterSettings
+) -> Tensor:
+    """Mask of the usable pixels that the other views do not outvote.
+
+    A contradiction counts against both pixels involved, so clear cases (two votes more against than for) leave first,
+    and the rest is judged without them.
+    """
+    votes = vote(prepare(depth_z, T_cam_world, K, usable, tolerance=tolerance))
+    usable = usable & (votes.contradict - votes.agree < 2)
+    votes = vote(prepare(depth_z, T_cam_world, K, usable, tolerance=tolerance))
+    silent = (votes.agree < settings.min_agreeing) & (votes.asked >= settings.min_asked)
+    return usable & (votes.contradict <= votes.agree) & ~silent
+
+
+def confident_pixels(conf: Tensor, usable: Tensor, *, drop_share: float) -> Tensor:
+    """Mask (...) of the `usable` pixels without the least confident `drop_share` of them (over all views together).
+
+    Pixels as confident as the threshold stay, so a constant confidence drops nothing.
+    """
+    values = conf[usable]
+    if drop_share <= 0 or values.numel() == 0:
+        return usable.clone()
+    # NumPy, because torch.quantile is limited to 16 million values.
+    threshold = float(np.quantile(values.detach().cpu().numpy(), drop_share, method="lower"))
+    return usable & (conf >= threshold)
+
+
+def flying_pixels(depth_z: Tensor, K: Tensor) -> Tensor:
+    """Mask (S, H, W) of pixels that hang between surfaces, as at depth edges.
+
+    Along a row and along a column, inverse depth of a plane is linear. A pixel of a surface is close to its
+    neighbour, or continues the line through the next two pixels, on at least one side, also at the surface's rim; a
+    pixel between two surfaces, or alone in the air, does neither. A blurred edge is smooth, but steeper than a surface
+    that a camera sees: beyond `STEEPEST_SLOPE` on both sides a pixel is dropped too.
+
+    Args:
+        depth_z: (S, H, W); invalid depth is never continued, and is not itself flagged.
+        K: (S, 3, 3) pixels of these maps.
+    """
+    usable = valid_depth(depth_z)
+    inverse = torch.where(usable, depth_z, torch.nan).reciprocal()
+    along_row = _continues(inverse, K[:, 0, 0]) if depth_z.shape[-1] > 2 else usable
+    along_column = _continues(inverse.mT, K[:, 1, 1]).mT if depth_z.shape[-2] > 2 else usable
+    return usable & ~(along_row & along_column)
+
+
+def _continues(inverse: Tensor, focal: Tensor) -> Tensor:
+    """Mask (S, H, W) of pixels that lie on the line of one of their two sides in the last dimension."""
+    before, after = _side(inverse, focal), _side(inverse.flip(-1), focal).flip(-1)
+    return before | after
+
+
+def _side(inverse: Tensor, focal: Tensor) -> Tensor:
+    near = torch.nn.functional.pad(inverse, (1, 0), value=torch.nan)[..., :-1]
+    far = torch.nn.functional.pad(inverse, (2, 0), value=torch.nan)[..., :-2]
+    steepest = STEEPEST_SLOPE / focal.to(inverse)[:, None, None]
+    step = (inverse - near).abs()
+    # Comparisons with NaN, the pixels that do not exist, are false.
+    on_line = (inverse - (2 * near - far)).abs() <= CONTINUATION_TOLERANCE * inverse
+    return (on_line | (step <= SMALL_STEP * inverse)) & (step <= steepest * inverse)

@@ -1,0 +1,110 @@
+"""The coloured point cloud of depth maps with cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from freegeo.errors import UserError
+from freegeo.fusion.filtering import confident_pixels, flying_pixels
+from freegeo.geometry.depth import depth_to_world, valid_depth
+
+__all__ = ["PointCloud", "coloured_points", "thin_points"]
+
+DROP_SHARE = 0.4
+"""Least confident share of the pixels that exports leave out, as the published ones do."""
+MAX_POINTS = 1_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointCloud:
+    """World points with the pixel each one comes from."""
+
+    points: np.ndarray
+    """(n, 3) float32 world coordinates, OpenCV axes."""
+    colours: np.ndarray
+    """(n, 3) uint8 RGB."""
+    conf: np.ndarray
+    """(n,) float32."""
+    view: np.ndarray
+    """(n,) int64 index of the view."""
+    pixel: np.ndarray
+    """(n, 2) int64 column and row in the view's depth map."""
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.points)
+
+    def select(self, index: np.ndarray) -> PointCloud:
+        """Return the points of an index array or a mask."""
+        return PointCloud(
+            points=self.points[index],
+            colours=self.colours[index],
+            conf=self.conf[index],
+            view=self.view[index],
+            pixel=self.pixel[index],
+        )
+
+
+def coloured_points(
+    depth_z: np.ndarray,
+    conf: np.ndarray,
+    T_cam_world: np.ndarray,
+    K: np.ndarray,
+    images: np.ndarray,
+    *,
+    keep: np.ndarray | None = None,
+    drop_share: float = DROP_SHARE,
+    drop_flying: bool = True,
+    max_points: int | None = MAX_POINTS,
+    seed: int = 0,
+) -> PointCloud:
+    """World points of the pixels worth showing, in the order view, row, column.
+
+    Args:
+        depth_z: (S, H, W).
+        conf: (S, H, W), higher is better.
+        T_cam_world: (S, 4, 4).
+        K: (S, 3, 3) pixels of the maps.
+        images: (S, H, W, 3) uint8.
+        keep: (S, H, W) bool; only these pixels are considered. Default all with valid depth.
+        drop_share: share in [0, 1) of the least confident pixels to leave out.
+        drop_flying: leave out pixels between surfaces (`filtering.flying_pixels`).
+        max_points: a seeded random choice of so many points when there are more; None keeps all.
+        seed: of that choice.
+
+    Raises:
+        UserError: `drop_share` is outside [0, 1), or `max_points` is below 1.
+    """
+    if not 0 <= drop_share < 1:
+        raise UserError(f"The share of points to drop must be from 0 to below 1, got {drop_share}.")
+    depth = torch.from_numpy(np.ascontiguousarray(depth_z)).float()
+    K_tensor = torch.from_numpy(np.ascontiguousarray(K)).float()
+    usable = valid_depth(depth)
+    if keep is not None:
+        usable &= torch.from_numpy(keep)
+    if drop_flying:
+        usable &= ~flying_pixels(depth, K_tensor)
+    usable = confident_pixels(torch.from_numpy(np.ascontiguousarray(conf)), usable, drop_share=drop_share)
+    index = thin_points(torch.nonzero(usable.flatten())[:, 0].numpy(), max_points=max_points, seed=seed)
+    world = depth_to_world(depth, K_tensor, torch.from_numpy(np.ascontiguousarray(T_cam_world)).float())
+    view, row, column = np.unravel_index(index, depth_z.shape)
+    return PointCloud(
+        points=world.flatten(0, 2).numpy()[index],
+        colours=images.reshape(-1, 3)[index],
+        conf=conf.reshape(-1)[index].astype(np.float32),
+        view=view,
+        pixel=np.stack((column, row), axis=-1),
+    )
+
+
+def thin_points(index: np.ndarray, *, max_points: int | None, seed: int) -> np.ndarray:
+    """Return at most `max_points` of `index` (n,), a seeded choice in the order given; UserError for less than 1."""
+    if max_points is not None and max_points < 1:
+        raise UserError(f"The number of points must be at least 1, got {max_points}.")
+    if max_points is None or len(index) <= max_points:
+        return index
+    chosen = np.random.default_rng(seed).choice(len(index), size=max_points, replace=False, shuffle=False)
+    return index[np.sort(chosen)]

@@ -1,0 +1,249 @@
+"""Photos -> adapter -> reconstruction folder: what `freegeo run` does, importable."""
+
+from __future__ import annotations
+
+import logging
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from freegeo import __version__
+from freegeo.adaptation import recipe as recipes
+from freegeo.adaptation.adapter import Adapter
+from freegeo.adaptation.adapter_files import PAGE, load_adapter, save_adapter
+from freegeo.adaptation.bank import SceneImages
+from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
+from freegeo.adaptation.trainer import STATE_FILE, Adapted, Engine, Progress
+from freegeo.adaptation.trainer import adapt as train_adapter
+from freegeo.errors import UserError
+from freegeo.export.glb import FILE_NAME as GLB_NAME
+from freegeo.export.glb import write_glb
+from freegeo.export.ply import FILE_NAME as PLY_NAME
+from freegeo.export.ply import write_ply
+from freegeo.export.reconstruction import FILE_NAME as PREDICTION_NAME
+from freegeo.export.reconstruction import Reconstruction
+from freegeo.fusion.points import coloured_points
+from freegeo.models.precision import Precision, autocast
+from freegeo.storage import FORMAT, RunFolder, read_json, write_json
+from freegeo.types import ImageBatch, PhotoLike
+
+if TYPE_CHECKING:
+    from freegeo.models.api import ReconstructionModel
+
+logger = logging.getLogger(__name__)
+
+SUMMARY_NAME = "reconstruction.json"
+FROZEN_FOLDER, ADAPTER_FOLDER = "frozen", "adapter"
+VIEWS_PER_CHUNK = 8
+SEED = 43
+
+
+@torch.no_grad()
+def predict(
+    model: ReconstructionModel,
+    batch: ImageBatch,
+    *,
+    reference: str | None = None,
+    device: torch.device | str = "cpu",
+    precision: Precision = "fp32",
+) -> Reconstruction:
+    """Reconstruct prepared images; an adapter that is in place is used as it stands.
+
+    `reference` None takes the model's own rule. Images are embedded a few at a time.
+    """
+    device = torch.device(device)
+    model.to(device).eval()
+    arithmetic = partial(autocast, device, precision)
+    with arithmetic():
+        chunks = [batch.images[i : i + VIEWS_PER_CHUNK] for i in range(0, len(batch), VIEWS_PER_CHUNK)]
+        tokens = [model.embed(chunk.to(device)[None]) for chunk in chunks]
+        features = model.aggregate(tokens[0].join_views(tokens), reference=reference or model.spec.reference)
+    return Reconstruction.from_prediction(model.decode(features), batch)
+
+
+def reconstruct(
+    model: ReconstructionModel, photos: Sequence[PhotoLike], *, adapter: Adapter | None = None, **options: Any
+) -> Reconstruction:
+    """Reconstruct photos: depth, confidence and cameras of every view.
+
+    With an `adapter` (already in place on the model) the first view is the reference, as in adaptation. `options` are
+    those of `predict`.
+    """
+    if adapter is not None:
+        options.setdefault("reference", "first")
+    return predict(model, model.preprocess(photos), **options)
+
+
+def adapt(
+    model: ReconstructionModel,
+    photos: Sequence[PhotoLike],
+    *,
+    recipe: str | Recipe = "scene",
+    seed: int = SEED,
+    engine: Engine | None = None,
+    **options: Any,
+) -> Adapted:
+    """Adapt a model to one scene's photos; the adapter stays in place (`result.adapter.detach()` takes it out).
+
+    `options` are those of `freegeo.adaptation.trainer.adapt`. UserError for fewer than 3 photos.
+    """
+    require_enough_photos(photos)
+    plan = recipes.named(recipe, model.spec) if isinstance(recipe, str) else recipe
+    scene = SceneImages.from_batch("photos", model.preprocess(photos))
+    return train_adapter(model, [scene], plan, seed=seed, engine=engine, **options)
+
+
+def require_enough_photos(photos: Sequence[PhotoLike]) -> None:
+    """Raise UserError when there are too few photos to hold one out."""
+    if len(photos) < SMALLEST_SCENE:
+        raise UserError(
+            f"adaptation needs at least {SMALLEST_SCENE} photos, got {len(photos)}. Add photos, or reconstruct without "
+            "adapting (--no-adapt, or `freegeo reconstruct`)."
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hooks:
+    """How a caller follows a run."""
+
+    stage: Callable[[str], None] = lambda name: None
+    step: Callable[[Progress], None] = lambda progress: None
+
+
+@dataclass
+class Job:
+    """Everything that turns photos into an output folder; each part that is already there is kept."""
+
+    model: ReconstructionModel
+    batch: ImageBatch
+    folder: RunFolder
+    recipe: Recipe | None
+    """None: reconstruct with the frozen model, or with `adapter`."""
+    adapter: Path | None = None
+    """A saved adapter to reconstruct with, instead of training one."""
+    seed: int = SEED
+    engine: Engine = field(default_factory=Engine)
+    reference: str | None = None
+    """Reference-view rule of the frozen model; None: the model's own."""
+    hooks: Hooks = field(default_factory=Hooks)
+    timings: dict[str, float] = field(default_factory=dict)
+    in_place: Adapter | None = None
+    """The adapter that the final prediction was made with; it stays on the model."""
+
+    def run(self) -> dict[str, Any]:
+        """Write everything and return the content of reconstruction.json."""
+        frozen = None
+        if self.recipe is not None:
+            frozen = self._predicted(self.folder / FROZEN_FOLDER, "frozen prediction", self.reference)
+            self._adapted()
+        elif self.adapter is not None:
+            self.in_place = load_adapter(self.model, self.adapter)
+        adapted = self.recipe is not None or self.adapter is not None
+        name = "adapted prediction" if adapted else "prediction"
+        final = self._predicted(self.folder.path, name, "first" if adapted else self.reference)
+        self._export(final)
+        summary = self._summary(final, frozen)
+        write_json(self.folder / SUMMARY_NAME, summary)
+        self.folder.finish()
+        return summary
+
+    def _predicted(self, folder: Path, stage: str, reference: str | None) -> Reconstruction:
+        if (folder / PREDICTION_NAME).is_file():
+            return Reconstruction.load(folder)
+        with self._timed(stage):
+            result = predict(
+                self.model, self.batch, reference=reference, device=self.engine.device, precision=self.engine.precision
+            )
+            result.save(folder)
+        return result
+
+    def _adapted(self) -> None:
+        """Train the adapter, or continue training it, or load the finished one."""
+        folder = self.folder / ADAPTER_FOLDER
+        if (folder / PAGE).is_file():
+            self.in_place = load_adapter(self.model, folder)
+            return
+        assert self.recipe is not None
+        scene = SceneImages.from_batch("photos", self.batch)
+        with self._timed("adaptation"):
+            result = train_adapter(
+                self.model, [scene], self.recipe, seed=self.seed, engine=self.engine, resume_in=folder,
+                on_step=self.hooks.step,
+            )  # fmt: skip
+        self.in_place = result.adapter
+        save_adapter(result.adapter, folder, result.page(["photos"]))
+        (folder / STATE_FILE).unlink(missing_ok=True)
+
+    def _export(self, final: Reconstruction) -> None:
+        if not final.has_cameras:
+            return
+        with self._timed("points and scene"):
+            T_cam_world, K = final.cameras()
+            cloud = coloured_points(final.depth_z, final.conf, T_cam_world, K, final.images)
+            write_ply(cloud, self.folder / PLY_NAME)
+            write_glb(cloud, T_cam_world, K, final.image_hw, self.folder / GLB_NAME)
+
+    def _summary(self, final: Reconstruction, frozen: Reconstruction | None) -> dict[str, Any]:
+        loaded = getattr(self.model, "loaded_from", None)
+        return {
+            "format": FORMAT,
+            "model": self.model.spec.name,
+            "checkpoint": {"file": loaded.file, "fingerprint": loaded.fingerprint} if loaded else None,
+            "licence_of_weights": self.model.spec.weights_licence,
+            "images": list(final.names),
+            "image_hw": list(final.image_hw),
+            "adapter": ADAPTER_FOLDER if self.recipe else (str(self.adapter) if self.adapter else None),
+            "frozen_prediction": f"{FROZEN_FOLDER}/{PREDICTION_NAME}" if frozen is not None else None,
+            "loss": self._loss_change(),
+            "settings": dict(self.folder.settings),
+            "seconds": {name: round(value, 2) for name, value in self.timings.items()},
+            "versions": versions(),
+        }
+
+    def _loss_change(self) -> dict[str, float] | None:
+        """Return the mean total loss of the first and last tenth of the steps."""
+        page = self.folder / ADAPTER_FOLDER / PAGE
+        if self.recipe is None or not page.is_file():
+            return None
+        return loss_change([terms["total"] for terms in read_json(page)["loss_curve"]])
+
+    def _timed(self, stage: str):
+        return _Timed(self, stage)
+
+
+class _Timed:
+    """Announces a stage and notes how long it took."""
+
+    def __init__(self, job: Job, stage: str):
+        self.job, self.stage = job, stage
+
+    def __enter__(self) -> None:
+        self.job.hooks.stage(self.stage)
+        self.started = time.monotonic()
+
+    def __exit__(self, *_) -> None:
+        self.job.timings[self.stage] = time.monotonic() - self.started
+
+
+def loss_change(totals: Sequence[float]) -> dict[str, float]:
+    """Return the mean of the first and of the last tenth of a loss curve."""
+    tenth = max(1, len(totals) // 10)
+    return {"first": sum(totals[:tenth]) / tenth, "last": sum(totals[-tenth:]) / tenth}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on."""
+    return {"freegeo": __version__, "torch": torch.__version__, "python": platform.python_version()}
+
+
+def settings_of(recipe: Recipe | None, **others: Any) -> Mapping[str, Any]:
+    """Return the settings that an output folder is compared by."""
+    from dataclasses import asdict
+
+    return {**others, "recipe": None if recipe is None else asdict(recipe)}

@@ -1,0 +1,248 @@
+"""Checkpoints load strictly, whatever their container; what does not fit or is damaged gives one clear sentence."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+TESTS = Path(__file__).parents[1]
+sys.path.append(str(TESTS))  # the parity modules are shared with the full parity run and lie beside this folder
+
+import parity_da3  # noqa: E402
+import parity_vggt  # noqa: E402
+from freegeo.errors import UserError  # noqa: E402
+from freegeo.models import catalog, da3_presets, vggt_presets  # noqa: E402
+from freegeo.models.checkpoints import find_file  # noqa: E402
+
+DA3 = TESTS / "fixtures" / "da3" / "tiny-mlp"
+VGGT = TESTS / "fixtures" / "vggt" / "tiny-smallvar"
+GAUSSIAN_HEAD, TRACKING_HEAD = 35_628_486, 65_941_396
+FINAL_NORM = "backbone.pretrained.norm.weight"
+
+
+@pytest.fixture(autouse=True)
+def small_models(monkeypatch):
+    """Put the two small models into the catalog, under the rules of the official files."""
+    small = (
+        catalog.ModelEntry(
+            name="small-da3", about="", licence="none", parameters=0, keys=da3_presets.keys,
+            build=lambda: parity_da3.empty_model(DA3),
+        ),
+        catalog.ModelEntry(
+            name="small-vggt", about="", licence="none", parameters=0, keys=vggt_presets.keys,
+            build=lambda: parity_vggt.empty_model(VGGT),
+        ),
+    )  # fmt: skip
+    own = {**catalog._own_entries(), **{item.name: item for item in small}}
+    monkeypatch.setattr(catalog, "_own_entries", lambda: own)
+
+
+def load(name: str, path: Path):
+    return catalog.load_model(name, checkpoint=path)
+
+
+def save(path: Path, tensors: dict[str, torch.Tensor]) -> Path:
+    if path.suffix == ".pt":
+        torch.save(tensors, path)
+    else:
+        save_file({name: value.clone() for name, value in tensors.items()}, path)
+    return path
+
+
+def one_sentence_about(error, *parts: str) -> bool:
+    text = str(error.value)
+    return "\n" not in text and len(text) < 500 and all(part in text for part in parts)
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
+@pytest.mark.parametrize(("name", "folder"), [("small-da3", DA3), ("small-vggt", VGGT)])
+def test_both_containers_load_to_the_same_frozen_model(tmp_path, name, folder, suffix):
+    stored = load_file(folder / "weights.safetensors")
+    model = load(name, save(tmp_path / f"copy{suffix}", stored))
+    state = model.state_dict()
+    assert {key.removeprefix("model.") for key in stored} <= state.keys()
+    assert all(torch.equal(state[key.removeprefix("model.")], value.float()) for key, value in stored.items())
+    assert not any(p.requires_grad for p in model.parameters()) and not model.training
+    assert model.loaded_from.licence == "none" and len(model.loaded_from.fingerprint) == 16
+
+
+def test_state_dict_under_the_name_model_is_found(tmp_path):
+    torch.save({"model": load_file(VGGT / "weights.safetensors"), "epoch": torch.tensor(3)}, tmp_path / "run.pt")
+    assert load("small-vggt", tmp_path / "run.pt").loaded_from.file == "run.pt"
+
+
+@pytest.mark.parametrize(
+    ("name", "folder"), [("small-da3", VGGT), ("small-vggt", DA3), ("vggt-1b", VGGT), ("da3-small", DA3)]
+)
+def test_checkpoint_of_another_model_is_refused(name, folder):
+    with pytest.raises(UserError, match="does not fit") as error:
+        load(name, folder / "weights.safetensors")
+    assert one_sentence_about(error, name, "first: ", "--checkpoint", "weights.safetensors")
+
+
+@pytest.mark.parametrize("prefix", ["model.", ""])
+@pytest.mark.parametrize("with_aliases", [False, True])
+def test_prefix_and_aliases_may_be_there_or_not(tmp_path, prefix, with_aliases):
+    tensors = {k.removeprefix("model."): v for k, v in load_file(DA3 / "weights.safetensors").items()}
+    aliases = da3_presets.keys().aliases
+    assert len(aliases) == 6 and not aliases.keys() & tensors.keys()
+    if with_aliases:
+        tensors |= {alias: tensors[stored] for alias, stored in aliases.items()}
+    model = load("small-da3", save(tmp_path / "m.safetensors", {prefix + k: v for k, v in tensors.items()}))
+    norms = [branch[2] for branch in model.head.scratch.output_conv2_aux]
+    assert all(torch.equal(norm.weight, norms[0].weight) for norm in norms)
+    assert not torch.equal(norms[3].weight, torch.ones_like(norms[3].weight))
+
+
+@pytest.mark.parametrize(
+    ("name", "folder", "extra"),
+    [("small-da3", DA3, "model.gs_head.weight"), ("small-vggt", VGGT, "track_head.tracker.query_ref_token")],
+)
+def test_parts_that_are_not_built_are_skipped_by_name_and_nothing_else_is(tmp_path, name, folder, extra):
+    tensors = load_file(folder / "weights.safetensors")
+    load(name, save(tmp_path / "full.safetensors", {**tensors, extra: torch.ones(2)}))
+    prefix = "model." if name == "small-da3" else ""
+    with pytest.raises(UserError, match=r"1 unexpected \(first: surprise\)"):
+        load(name, save(tmp_path / "more.safetensors", {**tensors, f"{prefix}surprise": torch.ones(2)}))
+
+
+def test_missing_and_misshapen_tensors_are_counted_and_named(tmp_path):
+    tensors = load_file(VGGT / "weights.safetensors")
+    del tensors["camera_head.trunk_norm.bias"]
+    tensors["aggregator.camera_token"] = torch.ones(1, 2, 32)
+    with pytest.raises(UserError) as error:
+        load("small-vggt", save(tmp_path / "m.safetensors", tensors))
+    parts = ("1 missing (first: camera_head.trunk_norm.bias)", "1 of another shape", "expected (1, 2, 1, 32)")
+    assert one_sentence_about(error, *parts)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_values_that_are_not_finite_are_refused(tmp_path, value):
+    tensors = load_file(DA3 / "weights.safetensors")
+    tensors[f"model.{FINAL_NORM}"][3] = value
+    with pytest.raises(UserError, match="1 tensors hold values that are not finite") as error:
+        load("small-da3", save(tmp_path / "m.safetensors", tensors))
+    assert FINAL_NORM in str(error.value)
+
+
+@pytest.mark.parametrize("kept", [0.97, 0.5, 0.001, 0.0])
+@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
+def test_truncated_files_are_refused(tmp_path, suffix, kept):
+    whole = save(tmp_path / f"whole{suffix}", load_file(VGGT / "weights.safetensors")).read_bytes()
+    cut = tmp_path / f"cut{suffix}"
+    cut.write_bytes(whole[: int(len(whole) * kept)])
+    with pytest.raises(UserError) as error:
+        load("small-vggt", cut)
+    assert one_sentence_about(error, str(cut))
+
+
+class Surprise:
+    """An object whose unpickling would run code."""
+
+    def __reduce__(self):
+        return Path.touch, (Path("unpickled"),)
+
+
+def test_pickles_are_never_executed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    torch.save({"weight": torch.ones(2), "more": Surprise()}, "model.pt")
+    with pytest.raises(UserError, match="never runs code") as error:
+        load("small-vggt", tmp_path / "model.pt")
+    assert one_sentence_about(error, "model.pt", ".safetensors download")
+    assert not Path("unpickled").exists()
+
+
+def test_pickle_under_another_name_is_refused(tmp_path):
+    torch.save({"weight": torch.ones(2)}, tmp_path / "model.safetensors")
+    with pytest.raises(UserError, match="not a safetensors file"):
+        load("small-vggt", tmp_path / "model.safetensors")
+
+
+def test_something_else_in_a_pt_file_is_refused(tmp_path):
+    torch.save([1, 2, 3], tmp_path / "list.pt")
+    with pytest.raises(UserError, match="not a plain state dict"):
+        load("small-vggt", tmp_path / "list.pt")
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(UserError, match=r"unknown kind of checkpoint '\.txt'"):
+        load("small-vggt", tmp_path / "notes.txt")
+
+
+def test_folder_stands_for_its_weight_file(tmp_path):
+    with pytest.raises(UserError, match="found 0 weight files"):
+        find_file(tmp_path)
+    (tmp_path / "vggt_1B_commercial.pt").touch()
+    assert find_file(tmp_path).name == "vggt_1B_commercial.pt"
+    (tmp_path / "one.safetensors").touch()
+    assert find_file(tmp_path).name == "one.safetensors"
+    (tmp_path / "two.safetensors").touch()
+    with pytest.raises(UserError, match="found 2 weight files"):
+        find_file(tmp_path)
+    (tmp_path / "model.safetensors").touch()
+    assert find_file(tmp_path).name == "model.safetensors"
+    with pytest.raises(UserError, match="no such checkpoint"):
+        find_file(tmp_path / "nowhere")
+
+
+def test_unknown_names_list_the_known_ones():
+    with pytest.raises(UserError, match=r"unknown model 'vgt'.*da3-base.*vggt-1b, vggt-1b-commercial"):
+        catalog.load_model("vgt")
+    with pytest.raises(UserError, match="not implemented yet"):
+        catalog.load_model("da3mono-large")
+
+
+@pytest.mark.parametrize(
+    ("name", "not_built"),
+    [
+        ("da3-small", 0),
+        ("da3-base", 0),
+        ("da3-large", 0),
+        ("da3-giant", GAUSSIAN_HEAD),
+        ("vggt-1b", TRACKING_HEAD),
+        ("vggt-1b-commercial", TRACKING_HEAD),
+    ],
+)
+def test_presets_have_the_published_number_of_parameters(name, not_built):
+    model = catalog.build_empty(name)
+    assert sum(p.numel() for p in model.parameters()) == catalog.entry(name).parameters - not_built
+    assert model.spec.weights_licence == catalog.entry(name).licence
+
+
+def test_totals_are_those_of_the_fact_sheets():
+    sheet = {
+        "da3-small": 34_299_463,
+        "da3-base": 135_366_599,
+        "da3-large": 410_941_767,
+        "da3-giant": 1_355_674_125,
+        "vggt-1b": 1_256_537_516,
+    }
+    assert {name: catalog.entry(name).parameters for name in sheet} == sheet
+
+
+def test_failed_download_says_what_to_do(monkeypatch):
+    import huggingface_hub
+    from huggingface_hub.errors import LocalEntryNotFoundError
+
+    asked = []
+
+    def offline(*where):
+        asked.append(where)
+        raise LocalEntryNotFoundError("offline")
+
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", offline)
+    with pytest.raises(UserError, match=r"Go online and run `freegeo models download vggt-1b`"):
+        catalog.load_model("vggt-1b")
+    with pytest.raises(UserError, match=r"Accept its licence at https://huggingface\.co/facebook/VGGT-1B-Commercial"):
+        catalog.load_model("vggt-1b-commercial")
+    assert asked == [
+        ("facebook/VGGT-1B", "model.safetensors"),
+        ("facebook/VGGT-1B-Commercial", "vggt_1B_commercial.pt"),
+    ]
+
+
+def test_listing_models_does_not_import_torch():
+    program = "import sys; from freegeo.models import catalog; catalog.names(); print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

@@ -1,0 +1,237 @@
+"""What holds for every reconstruction model here, on the small DA3 and the small VGGT with recorded weights."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+TESTS = Path(__file__).parents[1]
+sys.path.append(str(TESTS))  # the parity modules are shared with the full parity run and lie beside this folder
+
+import parity_da3  # noqa: E402
+import parity_vggt  # noqa: E402
+from fixture_tools import relative_error  # noqa: E402
+from freegeo.errors import UserError  # noqa: E402
+from freegeo.models.transformer import Block  # noqa: E402
+from freegeo.models.vggt import VGGT  # noqa: E402
+from freegeo.types import Features, ViewTokens  # noqa: E402
+
+FIXTURES = TESTS / "fixtures"
+BUILDERS = {
+    "da3": lambda: parity_da3.build(FIXTURES / "da3" / "tiny-mlp"),
+    "vggt": lambda: parity_vggt.build(FIXTURES / "vggt" / "tiny-smallvar"),
+}
+LAST, MIDDLE = -1, 2
+
+
+@pytest.fixture(scope="module", params=BUILDERS)
+def model(request):
+    return BUILDERS[request.param]()
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def images(views: int = 5, height: int = 28, width: int = 42, batch: int = 1) -> torch.Tensor:
+    return torch.rand(batch, views, 3, height, width, generator=torch.Generator().manual_seed(3))
+
+
+def assert_features_close(ours: Features, wanted: Features, tolerance: float = 1e-5):
+    assert ours.levels.keys() == wanted.levels.keys()
+    for layer in wanted.levels:
+        for mine, other in zip(ours.levels[layer], wanted.levels[layer], strict=True):
+            assert relative_error(mine, other) <= tolerance
+
+
+def block_calls(model: nn.Module, call) -> int:
+    counted = []
+    hooks = [m.register_forward_hook(lambda *_: counted.append(1)) for m in model.modules() if isinstance(m, Block)]
+    call()
+    for hook in hooks:
+        hook.remove()
+    return len(counted)
+
+
+@torch.no_grad()
+def test_tokens_of_selected_views_equal_those_of_selected_images(model):
+    x, kept = images(), [0, 2, 4]
+    selected, alone = model.embed(x).select(kept), model.embed(x[:, kept])
+    assert torch.equal(selected.tokens, alone.tokens)
+    assert selected.extra.keys() == alone.extra.keys()
+    assert all(torch.equal(selected.extra[name], alone.extra[name]) for name in alone.extra)
+
+
+@torch.no_grad()
+def test_student_shares_the_teachers_tokens(model):
+    x, kept = images(), [0, 2, 4]
+    tokens = model.embed(x)
+    together = ViewTokens.join_views([model.embed(x[:, [i]]) for i in range(5)])
+    assert_features_close(model.aggregate(together), model.aggregate(tokens))
+    assert_features_close(model.aggregate(tokens.select(kept)), model.aggregate(model.embed(x[:, kept])))
+
+
+@torch.no_grad()
+def test_fewer_views_change_the_features_of_those_that_stay(model):
+    tokens, kept = model.embed(images()), [0, 2, 4]
+    of_all, of_kept = model.aggregate(tokens).select(kept), model.aggregate(tokens.select(kept))
+    last = max(of_all.levels)
+    assert relative_error(of_all.levels[last][0], of_kept.levels[last][0]) > 1e-4
+
+
+@torch.no_grad()
+def test_scenes_of_a_batch_do_not_see_each_other(model):
+    tokens = model.embed(images(views=3, batch=2))
+    samples = [model.embed(images(views=3, batch=2)[[i]]) for i in (0, 1)]
+    alone = Features.stack([model.aggregate(sample) for sample in samples])
+    assert_features_close(model.aggregate(tokens), alone)
+    assert_features_close(model.aggregate(ViewTokens.stack(samples)), alone)
+
+
+@torch.no_grad()
+def test_views_after_the_first_may_come_in_any_order(model):
+    order = [0, 3, 1, 4, 2]
+    tokens = model.embed(images())
+    features = model.aggregate(tokens)
+    assert_features_close(model.aggregate(tokens.select(order)), features.select(order))
+    swapped = model.aggregate(tokens.select([1, 0, 2, 3, 4])).select([1, 0, 2, 3, 4])
+    last = max(features.levels)
+    assert relative_error(swapped.levels[last][0], features.levels[last][0]) > 1e-4
+
+
+@torch.no_grad()
+def test_cameras_and_maps_follow_the_order_of_the_views(model):
+    order = [0, 3, 1, 4, 2]
+    tokens = model.embed(images())
+    found = model.decode(model.aggregate(tokens))
+    shuffled = model.decode(model.aggregate(tokens.select(order)))
+    for name in ("depth_z", "conf", "T_cam_world", "K"):
+        assert relative_error(getattr(shuffled, name), getattr(found, name)[:, order]) <= 1e-4
+
+
+@torch.no_grad()
+def test_nothing_above_the_last_layer_asked_for_is_computed(model):
+    tokens = model.embed(images(views=3))
+    middle, last = model.spec.loss_layers[MIDDLE], model.spec.loss_layers[LAST]
+    until_middle = block_calls(model, lambda: model.aggregate(tokens, layers=[middle]))
+    until_last = block_calls(model, lambda: model.aggregate(tokens))
+    blocks_per_layer = 2 if isinstance(model, VGGT) else 1
+    assert until_last - until_middle == blocks_per_layer * (last - middle)
+
+
+@torch.no_grad()
+def test_layers_asked_for_alone_are_the_same(model):
+    tokens = model.embed(images(views=3))
+    middle = model.spec.loss_layers[MIDDLE]
+    features = model.aggregate(tokens, layers=[middle])
+    assert list(features.levels) == [middle]
+    patch, special = features.levels[middle]
+    wanted_patch, wanted_special = model.aggregate(tokens).levels[middle]
+    assert torch.equal(patch, wanted_patch) and torch.equal(special, wanted_special)
+    rows, columns = features.grid_hw
+    assert patch.shape[:3] == (1, 3, rows * columns)
+    assert special.shape[2] == model.spec.special_tokens
+
+
+@torch.no_grad()
+def test_decoding_without_its_layers_says_which_are_missing(model):
+    features = model.aggregate(model.embed(images(views=2)), layers=model.spec.loss_layers[:2])
+    with pytest.raises(UserError, match=r"lack \[\d+, \d+\]"):
+        model.decode(features)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("layers", [[99], [-1], []])
+def test_layers_that_do_not_exist_are_refused(model, layers):
+    with pytest.raises(UserError, match="has layers 0 to"):
+        model.aggregate(model.embed(images(views=2)), layers=layers)
+
+
+@pytest.mark.parametrize("height_width", [(28, 40), (30, 42)])
+def test_sides_must_be_multiples_of_the_patch(model, height_width):
+    with pytest.raises(ValueError, match="multiples of 14"):
+        model.embed(images(2, *height_width))
+
+
+@torch.no_grad()
+def test_unknown_rules_and_wishes_are_refused(model):
+    tokens = model.embed(images(views=3))
+    with pytest.raises(UserError, match="reference"):
+        model.aggregate(tokens, reference="best")
+    with pytest.raises(UserError, match="does not predict tracks"):
+        model.decode(model.aggregate(tokens), want=("depth", "tracks"))
+
+
+@torch.no_grad()
+def test_only_what_is_asked_for_is_decoded(model):
+    features = model.aggregate(model.embed(images(views=2)))
+    depth, cameras = model.decode(features, want=("depth",)), model.decode(features, want=("cameras",))
+    assert depth.depth_z.shape == (1, 2, 28, 42) == depth.conf.shape
+    assert depth.T_cam_world is depth.K is depth.rays is depth.points is None
+    assert cameras.T_cam_world.shape == (1, 2, 4, 4) and cameras.K.shape == (1, 2, 3, 3)
+    assert cameras.depth_z is cameras.conf is None
+    assert (depth.depth_z > 0).all() and (depth.conf > 1).all()
+
+
+@torch.no_grad()
+def test_chunks_of_dense_maps_join_to_those_of_single_views(model):
+    features = model.aggregate(model.embed(images(views=11, height=28, width=14)))
+    together = model.decode(features, want=("depth",)).depth_z
+    alone = torch.cat([model.decode(features.select([i]), want=("depth",)).depth_z for i in range(11)], dim=1)
+    assert relative_error(together, alone) <= 1e-5
+
+
+@torch.no_grad()
+def test_one_view_is_enough(model):
+    found = model.decode(model.aggregate(model.embed(images(views=1))))
+    assert found.depth_z.isfinite().all() and found.T_cam_world.isfinite().all() and found.K.isfinite().all()
+
+
+def test_recomputing_blocks_changes_neither_features_nor_gradients(model):
+    cross_view = next(m for m in model.modules() if hasattr(m, "recompute"))
+    tokens = model.embed(images(views=3))
+    token = model.get_parameter(model.camera_token_name)
+    results = []
+    for recompute in (False, True):
+        cross_view.recompute = recompute
+        token.requires_grad_(True).grad = None
+        loss = model.aggregate(tokens).levels[model.spec.loss_layers[LAST]][0].square().mean()
+        loss.backward()
+        results.append((loss.detach(), token.grad.clone()))
+    cross_view.recompute = False
+    token.requires_grad_(False)
+    assert torch.equal(results[0][0], results[1][0])
+    assert relative_error(results[1][1], results[0][1]) <= 1e-5
+    assert results[0][1].abs().amax(dim=tuple(range(2, token.ndim))).min() > 0, "both learned tokens get a gradient"
+
+
+def test_adapter_targets_are_all_linears_of_the_cross_view_blocks(model):
+    targets = model.adapter_targets()
+    assert len(set(targets)) == len(targets) > 0
+    assert all(isinstance(model.get_submodule(name), nn.Linear) for name in targets)
+    used = set()
+    hooks = [
+        module.register_forward_hook(lambda *_, name=name: used.add(name))
+        for name, module in model.named_modules()
+        if isinstance(module, nn.Linear)
+    ]
+    with torch.no_grad():
+        tokens = model.embed(images(views=2))
+        used.clear()
+        model.aggregate(tokens)
+    for hook in hooks:
+        hook.remove()
+    assert used == set(targets)
+
+
+@torch.no_grad()
+def test_features_and_tokens_survive_being_named_tensors(model):
+    tokens = model.embed(images(views=2))
+    features = model.aggregate(ViewTokens.from_tensors(tokens.tensors()))
+    assert_features_close(Features.from_tensors(features.tensors()), model.aggregate(tokens), tolerance=0)

@@ -1,0 +1,91 @@
+"""DA3 reproduces recorded numbers; its reference rules, early layers, known cameras and rays behave as described."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+TESTS = Path(__file__).parents[1]
+sys.path.append(str(TESTS))  # parity_da3.py is shared with the full parity run and lies beside this folder
+
+from fixture_tools import relative_error  # noqa: E402
+from freegeo.errors import UserError  # noqa: E402
+from freegeo.models import reference  # noqa: E402
+from freegeo.types import Cameras  # noqa: E402
+from parity_da3 import build, cases  # noqa: E402
+
+FOLDER = TESTS / "fixtures" / "da3"
+RECORDED = dict(cases(FOLDER))
+
+
+@pytest.fixture(scope="module")
+def model():
+    return build(FOLDER / "tiny-mlp")
+
+
+@pytest.fixture(scope="module")
+def tokens(model):
+    images = torch.rand(2, 5, 3, 28, 42, generator=torch.Generator().manual_seed(4))
+    with torch.no_grad():
+        return model.embed(images)
+
+
+def test_recorded_cases_are_found():
+    assert len(RECORDED) == 16
+
+
+@pytest.mark.parametrize("check", RECORDED.values(), ids=RECORDED.keys())
+def test_recorded_case(check: Callable[[], float]):
+    assert check() <= 1
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("rule", reference.RULES)
+def test_rule_puts_its_view_first_and_returns_input_order(model, tokens, rule):
+    features = model.aggregate(tokens, reference=rule)
+    order = model.view_order(tokens, rule)
+    for k in range(2):
+        views = list(range(5)) if order is None else order[k].tolist()
+        assert sorted(views) == list(range(5))
+        by_hand = model.aggregate(tokens.select(views), reference="first").select(
+            torch.tensor(views).argsort().tolist()
+        )
+        for layer, (patch, special) in features.levels.items():
+            assert relative_error(patch[k], by_hand.levels[layer][0][k]) <= 1e-5
+            assert relative_error(special[k], by_hand.levels[layer][1][k]) <= 1e-5
+
+
+@torch.no_grad()
+def test_two_views_keep_the_first_as_reference(model, tokens):
+    assert all(model.view_order(tokens.select([0, 1]), rule) is None for rule in reference.RULES)
+
+
+@torch.no_grad()
+def test_layer_before_the_views_mix_must_be_kept_by_embed(model):
+    images = torch.rand(1, 2, 3, 28, 28, generator=torch.Generator().manual_seed(5))
+    early = model.config.alt_start - 1
+    features = model.aggregate(model.embed(images, layers=[early]), layers=[early])
+    alone = model.aggregate(model.embed(images[:, [1]], layers=[early]), layers=[early])
+    assert relative_error(features.levels[early][0][:, 1:], alone.levels[early][0]) <= 1e-5
+    with pytest.raises(UserError, match=f"layer {early} was not kept"):
+        model.aggregate(model.embed(images), layers=[early])
+
+
+@torch.no_grad()
+def test_known_cameras_replace_the_learned_tokens(model, tokens):
+    cameras = Cameras(T_cam_world=torch.eye(4).repeat(2, 5, 1, 1), K=torch.eye(3).repeat(2, 5, 1, 1) * 40)
+    cameras.T_cam_world[..., 0, 3] = torch.arange(5.0)
+    plain, known = model.aggregate(tokens), model.aggregate(tokens, cameras=cameras)
+    last = max(plain.levels)
+    assert relative_error(known.levels[last][0], plain.levels[last][0]) > 1e-4
+
+
+@torch.no_grad()
+def test_rays_are_read_only_when_asked_for(model, tokens):
+    features = model.aggregate(tokens)
+    assert model.decode(features).rays is None
+    found = model.decode(features, want=("rays",))
+    assert found.rays.shape == (2, 5, 16, 24, 7)
+    assert (found.rays[..., 6] > 1).all() and found.depth_z is None

@@ -1,0 +1,190 @@
+"""VGGT's pure functions against recorded inputs and outputs; each check returns its worst error over the tolerance."""
+
+import json
+import math
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from safetensors.torch import load_file
+
+from fixture_tools import relative_error
+from freegeo.data.photos import load_photos
+from freegeo.geometry.camera import decode_world_to_camera, encode_world_to_camera
+from freegeo.geometry.depth import depth_to_world, unproject, valid_depth
+from freegeo.geometry.rotation import matrix_to_quat_xyzw, quat_xyzw_to_matrix
+from freegeo.geometry.se3 import inverse, to_4x4
+from freegeo.models.checkpoints import KeyRules
+from freegeo.models.dpt import depth_maps, uv_embedding
+from freegeo.models.transformer import position_table, rope_table, rotate
+from freegeo.models.vggt import CameraHead, point_map
+from freegeo.models.vggt_images import plan_size, preprocess
+from freegeo.types import ImageBatch
+
+FUNCTION = 1e-5
+NETWORK = 1e-4
+PILLOW_LEVEL, OPENCV_LEVEL = 1 / 255, 2 / 255
+MEAN = 1e-3
+CPU = torch.device("cpu")
+
+
+def check_rotation(path: Path) -> float:
+    values = load_file(path)
+    return max(
+        relative_error(quat_xyzw_to_matrix(values["quat_in"]), values["quat_to_mat"]) / FUNCTION,
+        relative_error(matrix_to_quat_xyzw(values["mat_in"]), values["mat_to_quat"]) / FUNCTION,
+    )
+
+
+def check_pose_encoding(path: Path) -> float:
+    values = load_file(path)
+    image_hw = tuple(values["image_hw"].tolist())
+    encoded = encode_world_to_camera(to_4x4(values["enc_extrinsics"]), values["enc_intrinsics"], image_hw)
+    errors = [relative_error(encoded, values["enc_pose"])]
+    for kind, pose in (("dec", values["dec_pose"]), ("roundtrip", values["enc_pose"])):
+        T_cam_world, K = decode_world_to_camera(pose, image_hw)
+        errors += [
+            relative_error(T_cam_world[..., :3, :], values[f"{kind}_extrinsics"]),
+            relative_error(K, values[f"{kind}_intrinsics"]),
+        ]
+    return max(errors) / FUNCTION
+
+
+def check_geometry(path: Path) -> float:
+    values = load_file(path)
+    if not torch.equal(valid_depth(values["depth"]), values["valid_mask"]):
+        return math.inf
+    T_cam_world, K = to_4x4(values["extrinsic"]), values["intrinsic"]
+    return max(
+        relative_error(unproject(values["depth"], K), values["cam_points"]) / FUNCTION,
+        relative_error(depth_to_world(values["depth"], K, T_cam_world), values["world_points"]) / FUNCTION,
+        relative_error(inverse(to_4x4(values["se3_in"])), values["se3_inverse"]) / FUNCTION,
+    )
+
+
+def check_rope(path: Path) -> float:
+    values = load_file(path)
+    errors = []
+    for name in (n.removesuffix(".x") for n in values if n.endswith(".x")):
+        for x, positions, wanted in zip(*(values[f"{name}.{part}"] for part in ("x", "pos", "y")), strict=True):
+            ours = rotate(x[None], rope_table(positions, x.shape[-1]))
+            errors.append(relative_error(ours[0], wanted))
+    return max(errors) / FUNCTION
+
+
+def check_position_table(path: Path) -> float:
+    values = load_file(path)
+    errors = []
+    for name in (n for n in values if n != "pos_embed"):
+        height, width = (int(part[1:]) // 14 for part in name.split("_"))
+        ours = position_table(values["pos_embed"], (height, width), size=(height, width), antialias=True)
+        errors.append(relative_error(ours, values[name]))
+    return max(errors) / FUNCTION
+
+
+def check_uv_embedding(path: Path) -> float:
+    errors = []
+    for name, wanted in load_file(path).items():
+        if name.endswith(".embed"):
+            channels, rows, columns, height, width = (int(part[1:]) for part in name[: -len(".embed")].split("_"))
+            ours = 0.1 * uv_embedding(channels, (rows, columns), width / height, CPU)
+            errors.append(relative_error(ours, wanted))
+    return max(errors) / FUNCTION
+
+
+def check_activations(path: Path) -> float:
+    values = load_file(path)
+    points = point_map(values["x"])["points"]
+    depth = depth_maps(values["x"][:, :2])
+    return max(
+        relative_error(points[..., :3], values["inv_log"]) / FUNCTION,
+        relative_error(points[..., 3], values["inv_log_conf"]) / FUNCTION,
+        relative_error(depth["depth_z"], values["exp"][..., 0]) / FUNCTION,
+        relative_error(depth["conf"], values["exp_conf"]) / FUNCTION,
+    )
+
+
+@torch.no_grad()
+def check_camera_head(path: Path) -> float:
+    values = load_file(path)
+    head = CameraHead(channels=64, depth=1, heads=4)
+    names = KeyRules(prefix="camera_head.").translate([n for n in values if n.startswith("camera_head.")])
+    head.load_state_dict({ours: values[name].float() for ours, name in names.items()})
+    poses = head(values["tokens_last"][:, :, 0], steps=6)
+    return max(relative_error(pose, values[f"pose_enc.{step}"]) for step, pose in enumerate(poses)) / NETWORK
+
+
+def check_preprocess(path: Path) -> float:
+    """Sizes and boxes of the table, then sampled pixels of the pictures that the second file holds."""
+    table = json.loads(path.read_text())
+    if not all(check_sizes(row) for row in table["sizes"]):
+        return math.inf
+    pixels = path.with_name("preprocess_pixels.safetensors")
+    values = load_file(pixels) if pixels.is_file() else {}
+    return max((check_pixels(case, values) for case in table["pixels"] if values), default=0.0)
+
+
+def check_sizes(row: dict) -> bool:
+    photo = (row["height"], row["width"])
+    finals = {mode: plan_size(photo, mode=mode, side=518, patch=14).final for mode in ("crop", "pad")}
+    finals["longest504"] = plan_size(photo, mode="longest", side=504, patch=14).final
+    pad = plan_size(photo, mode="pad", side=518, patch=14)
+    top, left = pad.offset_yx
+    good = all(list(size) == row[mode] for mode, size in finals.items())
+    good &= [top, left, top + pad.resized[0], left + pad.resized[1]] == row["pad_content_tlbr"]
+    if row["square1024_coords"] is not None:
+        square = plan_size(photo, mode="square", side=1024, patch=14)
+        (top, left), (scale, _) = square.offset_yx, square.scale_yx
+        box = [left, top, left + photo[1] * scale, top + photo[0] * scale, photo[1], photo[0]]
+        good &= np.allclose(box, row["square1024_coords"], atol=1e-3)
+    return bool(good)
+
+
+def check_pixels(case: dict, values: dict[str, torch.Tensor]) -> float:
+    sources = case.get("sources") or [[case["source_width"], case["source_height"]]]
+    means = case["channel_mean"] if "sources" in case else [case["channel_mean"]]
+    mode = "longest" if case["mode"] == "longest504" else case["mode"]
+    batch = read_synthetic(sources, case.get("alpha", False), mode, case.get("target_size", 518))
+    if list(batch.images.shape[-2:]) != (case.get("out_hw") or case["out_shape"][-2:]):
+        return math.inf
+    level = OPENCV_LEVEL if mode == "longest" else PILLOW_LEVEL
+    errors = []
+    for k, image in enumerate(batch.images):
+        name = f"{case['id']}{k}" if "sources" in case else case["id"]
+        rows, columns = values[f"{name}.yx"].long().unbind(1)
+        errors.append(float((image[:, rows, columns].T - values[f"{name}.rgb"]).abs().max()) / level)
+        errors.append(float((image.mean((1, 2)) - torch.tensor(means[k])).abs().max()) / MEAN)
+    return max(errors)
+
+
+def read_synthetic(sources: list[list[int]], alpha: bool, mode: str, side: int) -> ImageBatch:
+    """Write the recordings' pictures as files and read them back through the photo loader."""
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / f"{k}.png" for k in range(len(sources))]
+        for path, (width, height) in zip(paths, sources, strict=True):
+            Image.fromarray(synthetic(width, height, alpha)).save(path)
+        return preprocess(load_photos(paths), mode=mode, side=side, patch=14)
+
+
+def synthetic(width: int, height: int, alpha: bool = False) -> np.ndarray:
+    y, x = np.mgrid[:height, :width].astype(np.int64)
+    channels = [3 * x + 5 * y, x * y // 7, x**2 // 11 + 2 * y**2 // 13]
+    if alpha:
+        channels.append(3 * (x + 2 * y))
+    return (np.stack(channels, axis=-1) % 256).astype(np.uint8)
+
+
+FUNCTIONS: dict[str, Callable[[Path], float]] = {
+    "rotation.safetensors": check_rotation,
+    "pose_encoding.safetensors": check_pose_encoding,
+    "geometry.safetensors": check_geometry,
+    "rope2d.safetensors": check_rope,
+    "dino_pos_embed.safetensors": check_position_table,
+    "dpt_pos_embed.safetensors": check_uv_embedding,
+    "activations.safetensors": check_activations,
+    "camera_head_iters.safetensors": check_camera_head,
+    "preprocess.json": check_preprocess,
+}

@@ -1,0 +1,102 @@
+"""Models of a few thousand parameters with seeded random weights, adapters on them, and scenes of noise."""
+
+import torch
+from torch import Tensor, nn
+
+from freegeo.adaptation.adapter import Adapter
+from freegeo.adaptation.bank import SceneImages
+from freegeo.adaptation.recipe import Recipe, scene
+from freegeo.models.api import AdaptationDefaults, ModelSpec, ReconstructionModel
+from freegeo.models.da3 import DA3, DA3Config
+from freegeo.models.vggt import VGGT, VGGTConfig
+
+PATCH = 8
+DEFAULTS = AdaptationDefaults(temperature=1.0, scene_lr=3e-3, rank=4)
+
+
+def tiny_da3(seed: int = 0, ffn: str = "mlp", name: str = "tiny-da3") -> DA3:
+    """Two per-view blocks and four cross-view ones, width 32."""
+    config = DA3Config(
+        width=32, depth=6, heads=2, out_layers=(2, 3, 4, 5), alt_start=2, qknorm_start=2, rope_start=2, ffn=ffn,
+        head_features=8, head_channels=(4, 8, 8, 8), patch_size=PATCH, position_grid=4,
+        camera_encoder_depth=1, camera_encoder_heads=2,
+    )  # fmt: skip
+    return randomise(DA3(config, _spec(name, config.out_layers, special=1)), seed)
+
+
+def tiny_vggt(seed: int = 0, name: str = "tiny-vggt") -> VGGT:
+    """Two encoder blocks and four pairs of frame and global blocks, width 32."""
+    config = VGGTConfig(
+        width=32, depth=4, heads=2, encoder_depth=2, encoder_heads=2, camera_depth=1, camera_heads=2,
+        out_layers=(0, 1, 2, 3), head_features=8, head_channels=(4, 8, 8, 8), registers=2, patch_size=PATCH,
+        position_grid=4,
+    )  # fmt: skip
+    return randomise(VGGT(config, _spec(name, config.out_layers, special=config.special)), seed)
+
+
+def randomise(model: nn.Module, seed: int) -> nn.Module:
+    """Draw every weight so that signals keep their size, and freeze the model as loading does."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            drawn = torch.randn(parameter.shape, generator=generator)
+            if parameter.ndim > 1:
+                parameter.copy_(drawn * parameter[0].numel() ** -0.5)
+            elif name.endswith("bias"):
+                parameter.copy_(drawn * 0.1)
+            parameter.requires_grad_(False)
+    return model.eval()
+
+
+def noise(views: int, seed: int = 0, side: int = 4 * PATCH) -> Tensor:
+    """Return images (S, 3, side, side): one smooth random scene, seen with noise."""
+    generator = torch.Generator().manual_seed(seed)
+    shared = torch.rand(1, 3, side, side, generator=generator)
+    return (shared + 0.3 * torch.randn(views, 3, side, side, generator=generator)).clamp(0, 1)
+
+
+def noise_scene(views: int, seed: int = 0) -> SceneImages:
+    """Return a scene of noise."""
+    images = noise(views, seed)
+    return SceneImages(name=f"noise-{seed}", count=views, load=lambda frames: images[list(frames)])
+
+
+def quick(model: ReconstructionModel, **changes) -> Recipe:
+    """Return the recipe `scene`, small enough for a test."""
+    length = {} if "epochs" in changes else {"steps": 4}
+    return scene(model.spec).changed(**{**length, "sets_per_scene": 3, "distinct_seeds": 3, **changes})
+
+
+def outputs(model: ReconstructionModel, images: Tensor) -> list[Tensor]:
+    """Return depth, confidence and cameras of images (S, 3, H, W)."""
+    with torch.no_grad():
+        found = model.decode(model.aggregate(model.embed(images[None])))
+    return [found.depth_z, found.conf, found.T_cam_world, found.K]
+
+
+def same(one: list[Tensor], two: list[Tensor]) -> bool:
+    """Say whether two lists of tensors agree in every bit."""
+    return all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
+
+
+def attach(model: ReconstructionModel, rank: int = 4, seed: int = 0, dropout: float = 0.0, **options) -> Adapter:
+    """Put a fresh adapter on a model."""
+    generator = torch.Generator().manual_seed(seed)
+    return Adapter.attach(model, rank=rank, alpha=rank, dropout=dropout, generator=generator, **options)
+
+
+def trained(model: ReconstructionModel, seed: int = 1) -> Adapter:
+    """Put an adapter on a model, with random values in the place of trained ones."""
+    adapter = attach(model)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in adapter.parameters():
+            parameter.add_(torch.randn(parameter.shape, generator=generator) * 0.1)
+    return adapter
+
+
+def _spec(name: str, layers: tuple[int, ...], special: int) -> ModelSpec:
+    return ModelSpec(
+        name=name, patch_size=PATCH, default_side=4 * PATCH, loss_layers=layers, reference="first",
+        special_tokens=special, weights_licence="none", adaptation=DEFAULTS,
+    )  # fmt: skip
