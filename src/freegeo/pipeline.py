@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from freegeo import __version__
@@ -22,13 +23,11 @@ from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
 from freegeo.adaptation.trainer import STATE_FILE, Adapted, Engine, Progress
 from freegeo.adaptation.trainer import adapt as train_adapter
 from freegeo.errors import UserError
-from freegeo.export.glb import FILE_NAME as GLB_NAME
-from freegeo.export.glb import write_glb
-from freegeo.export.ply import FILE_NAME as PLY_NAME
-from freegeo.export.ply import write_ply
+from freegeo.export.formats import export, filter_reconstruction
+from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import FILE_NAME as PREDICTION_NAME
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.fusion.points import coloured_points
+from freegeo.fusion.filtering import FilterReport, FilterSettings
 from freegeo.models.precision import Precision, autocast
 from freegeo.storage import FORMAT, RunFolder, read_json, write_json
 from freegeo.types import ImageBatch, PhotoLike
@@ -40,6 +39,7 @@ logger = logging.getLogger(__name__)
 
 SUMMARY_NAME = "reconstruction.json"
 FROZEN_FOLDER, ADAPTER_FOLDER = "frozen", "adapter"
+FORMATS = ("ply", "glb")
 VIEWS_PER_CHUNK = 8
 SEED = 43
 
@@ -131,8 +131,17 @@ class Job:
     engine: Engine = field(default_factory=Engine)
     reference: str | None = None
     """Reference-view rule of the frozen model; None: the model's own."""
+    formats: Sequence[str] = FORMATS
+    """Files to write besides the predictions, names of `freegeo.export.formats.WRITERS`."""
+    filters: FilterSettings = field(default_factory=FilterSettings)
+    masks: list[np.ndarray] | None = None
+    """One (H, W) array per photo at its size, not zero where points are wanted."""
     hooks: Hooks = field(default_factory=Hooks)
     timings: dict[str, float] = field(default_factory=dict)
+    command: str | None = None
+    """The command line, for reconstruction.json."""
+    after: Callable[[Job], None] = lambda job: None
+    """Writes more before the folder counts as finished."""
     in_place: Adapter | None = None
     """The adapter that the final prediction was made with; it stays on the model."""
 
@@ -147,9 +156,10 @@ class Job:
         adapted = self.recipe is not None or self.adapter is not None
         name = "adapted prediction" if adapted else "prediction"
         final = self._predicted(self.folder.path, name, "first" if adapted else self.reference)
-        self._export(final)
-        summary = self._summary(final, frozen)
+        report = self._export(final)
+        summary = self._summary(final, frozen, report)
         write_json(self.folder / SUMMARY_NAME, summary)
+        self.after(self)
         self.folder.finish()
         return summary
 
@@ -180,16 +190,19 @@ class Job:
         save_adapter(result.adapter, folder, result.page(["photos"]))
         (folder / STATE_FILE).unlink(missing_ok=True)
 
-    def _export(self, final: Reconstruction) -> None:
+    def _export(self, final: Reconstruction) -> FilterReport | None:
+        """Filter once and write all formats; None without cameras, which have no points."""
         if not final.has_cameras:
-            return
-        with self._timed("points and scene"):
-            T_cam_world, K = final.cameras()
-            cloud = coloured_points(final.depth_z, final.conf, T_cam_world, K, final.images)
-            write_ply(cloud, self.folder / PLY_NAME)
-            write_glb(cloud, T_cam_world, K, final.image_hw, self.folder / GLB_NAME)
+            return None
+        with self._timed("points and files"):
+            masks = None if self.masks is None else masks_for_model(final, self.masks)
+            filtered = filter_reconstruction(final, masks=masks, settings=self.filters)
+            export(final, self.folder.path, self.formats, filtered=filtered, seed=self.seed)
+        return filtered[1]
 
-    def _summary(self, final: Reconstruction, frozen: Reconstruction | None) -> dict[str, Any]:
+    def _summary(
+        self, final: Reconstruction, frozen: Reconstruction | None, report: FilterReport | None
+    ) -> dict[str, Any]:
         loaded = getattr(self.model, "loaded_from", None)
         return {
             "format": FORMAT,
@@ -201,7 +214,10 @@ class Job:
             "adapter": ADAPTER_FOLDER if self.recipe else (str(self.adapter) if self.adapter else None),
             "frozen_prediction": f"{FROZEN_FOLDER}/{PREDICTION_NAME}" if frozen is not None else None,
             "loss": self._loss_change(),
+            "filters": None if report is None else {"pixels": report.pixels, "removed": dict(report.removed)},
+            "recipe": self.folder.settings.get("recipe"),
             "settings": dict(self.folder.settings),
+            "command": self.command,
             "seconds": {name: round(value, 2) for name, value in self.timings.items()},
             "versions": versions(),
         }

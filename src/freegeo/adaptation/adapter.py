@@ -7,9 +7,9 @@ while the adapter is on. The base weights are never touched before `merge`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor, nn
@@ -31,7 +31,7 @@ def count_trainable(model: ReconstructionModel, rank: int) -> int:
     The model may be on the meta device.
     """
     part = model.adaptable()
-    linears = [part.get_submodule(name) for name in part.adapter_targets()]
+    linears = [cast(nn.Linear, part.get_submodule(name)) for name in part.adapter_targets()]
     lora = sum(rank * (linear.in_features + linear.out_features) for linear in linears)
     token = part.get_parameter(part.camera_token_name).numel() if part.camera_token_name else 0
     return lora + token
@@ -83,9 +83,14 @@ class Adapter:
                 f"{len(unmatched)} of {len(wanted)} adapter targets are no linear layers of {part.spec.name} "
                 f"(first: {unmatched[0]}). The adapter belongs to another model."
             )
-        config = LoraConfig(r=rank, lora_alpha=alpha, lora_dropout=dropout, target_modules=list(wanted), bias="none")
-        inject_adapter_in_model(config, part, adapter_name=ADAPTER_NAME)
-        layers = {name: part.get_submodule(name) for name in wanted}
+        config = LoraConfig(
+            r=rank, lora_alpha=alpha, lora_dropout=dropout, target_modules=list(wanted), bias="none",
+            exclude_modules=_same_endings(modules, wanted) or None,
+        )  # fmt: skip
+        # peft fills the new layers from the global generator, which is not ours to turn.
+        with torch.random.fork_rng(devices=[]):
+            inject_adapter_in_model(config, part, adapter_name=ADAPTER_NAME)
+        layers = {name: cast(LoraLayer, part.get_submodule(name)) for name in wanted}
         for layer in layers.values():
             _draw_start(layer, generator)
         config.target_modules = wanted
@@ -94,9 +99,9 @@ class Adapter:
     def named_parameters(self) -> dict[str, nn.Parameter]:
         """Return everything that is trained, by name: `<module>.lora_A.weight`, `.lora_B.weight`, `camera_token`."""
         named = {
-            f"{name}.{matrix}.weight": getattr(layer, matrix)[ADAPTER_NAME].weight
+            f"{name}.{matrix}.weight": weight
             for name, layer in self.layers.items()
-            for matrix in ("lora_A", "lora_B")
+            for matrix, weight in zip(("lora_A", "lora_B"), _matrices(layer), strict=True)
         }
         return named if self.camera_token is None else {**named, "camera_token": self.camera_token}
 
@@ -115,7 +120,7 @@ class Adapter:
         self.set_strength(self.strength)
 
     @contextmanager
-    def off(self) -> Iterator[None]:
+    def off(self) -> Generator[None]:
         """Run the frozen model inside the block: LoRA bypassed, original camera token, nothing forgotten after it."""
         token = _parameter(self.model, self.model.camera_token_name)
         flags = [parameter.requires_grad for parameter in self.parameters()]
@@ -135,11 +140,11 @@ class Adapter:
         self.strength = strength
         for name, layer in self.layers.items():
             layer.scaling[ADAPTER_NAME] = self._scaling[name] * strength
-        if self.camera_token is not None:
-            mixed = self.camera_token
-            if strength != 1:
-                mixed = nn.Parameter(self._base_token.lerp(self.camera_token.detach(), strength), requires_grad=False)
-            self._install_token(mixed)
+        if self.camera_token is None or self._base_token is None or strength == 1:
+            self._install_token(self.camera_token)
+        else:
+            mixed = self._base_token.detach().lerp(self.camera_token.detach().to(self._base_token), strength)
+            self._install_token(nn.Parameter(mixed, requires_grad=False))
 
     def merge(self) -> ReconstructionModel:
         """Fold the adapter (at its strength) into the weights and return the plain model; the adapter is used up."""
@@ -169,20 +174,33 @@ class Adapter:
             layer.enable_adapters(enabled)
 
     def _install_token(self, token: nn.Parameter | None) -> None:
-        if token is not None:
-            owner, _, leaf = self.model.camera_token_name.rpartition(".")
-            self.model.get_submodule(owner)._parameters[leaf] = token
+        if token is None or self.model.camera_token_name is None:
+            return
+        owner, _, leaf = self.model.camera_token_name.rpartition(".")
+        parameters = self.model.get_submodule(owner)._parameters
+        # A model that was moved meanwhile took along only the token that was in place.
+        token.data = token.data.to(parameters[leaf])
+        parameters[leaf] = token
 
 
+def _same_endings(modules: Iterable[str], wanted: Sequence[str]) -> list[str]:
+    """Return the other modules that peft would take for targets: it matches by the end of a name."""
+    endings = tuple(f".{name}" for name in wanted)
+    return [name for name in modules if name.endswith(endings) and name not in set(wanted)]
+
+
+def _matrices(layer: LoraLayer) -> tuple[nn.Parameter, nn.Parameter]:
+    a, b = (cast(nn.Linear, matrix[ADAPTER_NAME]) for matrix in (layer.lora_A, layer.lora_B))
+    return cast(nn.Parameter, a.weight), cast(nn.Parameter, b.weight)
+
+
+@torch.no_grad()
 def _draw_start(layer: LoraLayer, generator: torch.Generator) -> None:
-    weight = layer.lora_A[ADAPTER_NAME].weight
-    bound = 1 / math.sqrt(weight.shape[1])
-    drawn = torch.rand(weight.shape, generator=generator) * 2 * bound - bound
-    with torch.no_grad():
-        weight.copy_(drawn)
-        layer.lora_B[ADAPTER_NAME].weight.zero_()
+    a, b = _matrices(layer)
+    bound = 1 / math.sqrt(a.shape[1])
+    a.copy_(torch.rand(a.shape, generator=generator) * 2 * bound - bound)
+    b.zero_()
 
 
 def _parameter(model: nn.Module, name: str | None) -> nn.Parameter | None:
     return None if name is None else model.get_parameter(name)
-

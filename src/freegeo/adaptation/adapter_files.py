@@ -1,71 +1,64 @@
 """Adapters on disk: peft's own two files, the camera token, and a page that says what the adapter is.
 
-    ADAPTER/  adapter_config.json  adapter_model.safetensors    peft's format
-              camera_token.safetensors
-              freegeo.json         base model and its fingerprint, recipe, seed, scenes, loss curve
+ADAPTER/  adapter_config.json  adapter_model.safetensors    peft's format
+          camera_token.safetensors                          where the model has a camera token
+          freegeo.json         base model and its fingerprint, recipe, seed, scenes, loss curve
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
 from freegeo.adaptation.adapter import Adapter
+from freegeo.adaptation.peft_files import lora_layers, read_peft, write_peft
+from freegeo.adaptation.published import is_published, own_names, read_camera_token
 from freegeo.errors import UserError
 from freegeo.models.checkpoints import read_tensors, require_match
-from freegeo.storage import FORMAT, atomic_path, read_json, write_json, write_tensors
+from freegeo.storage import FORMAT, read_json, write_json, write_tensors
 
 if TYPE_CHECKING:
     from freegeo.models.api import ReconstructionModel
 
-PEFT_PREFIX = "base_model.model."
-CONFIG, WEIGHTS, TOKEN, PAGE = (
-    "adapter_config.json",
-    "adapter_model.safetensors",
-    "camera_token.safetensors",
-    "freegeo.json",
-)
+TOKEN, PAGE = "camera_token.safetensors", "freegeo.json"
 
 
 def save_adapter(adapter: Adapter, folder: Path, page: Mapping[str, Any]) -> list[Path]:
-    """Write an adapter; `page` is what freegeo.json adds to the base model's identity. Returns the files."""
+    """Write an adapter at strength 1; `page` is what freegeo.json adds to the base model's identity.
+
+    Returns the files.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    named = {name: value.float() for name, value in adapter.named_parameters().items()}
-    token = named.pop("camera_token", None)
-    write_tensors(folder / WEIGHTS, {PEFT_PREFIX + name: value for name, value in named.items()}, {"format": "pt"})
-    _write_peft_config(adapter, folder / CONFIG)
-    files = [folder / CONFIG, folder / WEIGHTS]
-    if token is not None:
-        write_tensors(folder / TOKEN, {"camera_token": token})
+    files = write_peft(adapter, folder)
+    if adapter.camera_token is not None:
+        write_tensors(folder / TOKEN, {"camera_token": adapter.camera_token.float()})
         files.append(folder / TOKEN)
     write_json(folder / PAGE, {"format": FORMAT, "base": _base(adapter.model), **page})
     return [*files, folder / PAGE]
 
 
 def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
-    """Attach a saved adapter, on and at strength 1, for inference.
+    """Attach a saved adapter, on and at strength 1, for inference; the model stays as it was when this fails.
 
-    UserError when the folder is no adapter, or when it was made for another model (by layer names and shapes; a
-    differing fingerprint of the same architecture is an error too).
+    Reads our own folders, plain peft folders and the authors' published layout. UserError when the folder is no
+    adapter, or when it was made for another model (by layer names and shapes; a differing fingerprint of the same
+    architecture is an error too).
     """
-    folder = Path(folder)
-    config, page = _read_config(folder), adapter_page(folder)
-    if page is not None:
-        _require_same_base(model, page["base"], folder)
-    tensors = {name.removeprefix(PEFT_PREFIX): value for name, value in read_tensors(folder / WEIGHTS).items()}
-    if (folder / TOKEN).is_file():
-        tensors |= read_tensors(folder / TOKEN)
+    folder, model = Path(folder), model.adaptable()
+    config, tensors = read_peft(folder)
+    _require_same_base(model, adapter_page(folder), folder)
+    tensors = own_names(model, tensors) | _camera_token(model, folder)
     adapter = Adapter.attach(
         model,
         rank=config["r"],
         alpha=config["lora_alpha"],
         dropout=0.0,
         generator=torch.Generator(),
-        targets=sorted({name.rsplit(".lora_", 1)[0] for name in tensors if ".lora_" in name}),
+        targets=lora_layers(tensors),
     )
     ours = {name: tuple(value.shape) for name, value in adapter.named_parameters().items()}
     if "camera_token" not in tensors:
@@ -83,23 +76,17 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
 
 
 def adapter_page(folder: Path) -> dict[str, Any] | None:
-    """Return freegeo.json of an adapter folder; None for a plain peft adapter."""
+    """Return freegeo.json of an adapter folder; None for an adapter that freegeo did not write."""
     return read_json(folder / PAGE) if (folder / PAGE).is_file() else None
 
 
-def _write_peft_config(adapter: Adapter, path: Path) -> None:
-    values = adapter.lora_config.to_dict()
-    values["target_modules"] = sorted(values["target_modules"])
-    values["inference_mode"] = True
-    values["base_model_name_or_path"] = adapter.model.spec.name
-    with atomic_path(path) as part:
-        part.write_text(json.dumps(values, indent=2, sort_keys=True, default=_plain) + "\n", encoding="utf-8")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, set | frozenset):
-        return sorted(value)
-    return str(getattr(value, "value", value))
+def _camera_token(model: ReconstructionModel, folder: Path) -> dict[str, Tensor]:
+    if (folder / TOKEN).is_file():
+        return read_tensors(folder / TOKEN)
+    # A plain peft adapter leaves the token alone; the authors' never does.
+    if is_published(folder) and model.camera_token_name is not None:
+        return {"camera_token": read_camera_token(folder)}
+    return {}
 
 
 def _base(model: ReconstructionModel) -> dict[str, str]:
@@ -111,17 +98,12 @@ def _base(model: ReconstructionModel) -> dict[str, str]:
     }
 
 
-def _read_config(folder: Path) -> dict[str, Any]:
-    if not (folder / CONFIG).is_file() or not (folder / WEIGHTS).is_file():
-        raise UserError(f"{folder}: not an adapter folder ({CONFIG} and {WEIGHTS} are expected).")
-    config = read_json(folder / CONFIG)
-    if config.get("peft_type") != "LORA":
-        raise UserError(f"{folder}: holds a {config.get('peft_type')} adapter; only LoRA is supported.")
-    return config
-
-
-def _require_same_base(model: ReconstructionModel, base: Mapping[str, str], folder: Path) -> None:
-    mine = _base(model)
+def _require_same_base(model: ReconstructionModel, page: Mapping[str, Any] | None, folder: Path) -> None:
+    if page is None:
+        return
+    if page["format"] > FORMAT:
+        raise UserError(f"{folder}: written by a newer freegeo (format {page['format']}). Update freegeo.")
+    base, mine = page["base"], _base(model)
     if base["model"] != mine["model"]:
         raise UserError(f"{folder}: the adapter was made for {base['model']}, not for {mine['model']}. Use that model.")
     if base["fingerprint"] and mine["fingerprint"] and base["fingerprint"] != mine["fingerprint"]:

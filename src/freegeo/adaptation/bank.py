@@ -2,51 +2,71 @@
 
 from __future__ import annotations
 
-import random
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from freegeo.adaptation.cache import TensorCache
+from freegeo.adaptation.engine import Engine
+from freegeo.adaptation.images import ImageQueue, SceneImages, released_augmentation
 from freegeo.adaptation.recipe import Recipe
-from freegeo.adaptation.views import ViewSet
+from freegeo.adaptation.views import ViewSet, Visit
 from freegeo.models.api import ReconstructionModel
-from freegeo.types import ImageBatch, ViewTokens
+from freegeo.types import ViewTokens
 
-VIEWS_PER_CHUNK = 8
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneImages:
-    """The images of one scene; `load` returns the chosen ones as (S, 3, H, W) in [0, 1], all of one size."""
-
-    name: str
-    count: int
-    load: Callable[[Sequence[int]], Tensor]
-
-    @classmethod
-    def from_batch(cls, name: str, batch: ImageBatch) -> SceneImages:
-        """Use images that are already at the model's size."""
-        return cls(name=name, count=len(batch), load=lambda frames: batch.images[list(frames)])
+ViewKey = tuple[int, int, int | None]
+"""Scene, frame, and what augmentation made of it."""
+SetKey = tuple[int, tuple[int, ...], tuple[int, ...], int | None]
+Access = tuple[ViewSet, tuple[int, ...]]
+"""A view set and the positions of it that somebody reads."""
 
 
-def released_augmentation(images: Tensor, seed: int) -> Tensor:
-    """Mirror a whole view set and change the brightness of some views, as a fixed function of the set's seed.
+def set_key(view_set: ViewSet, recipe: Recipe) -> SetKey:
+    """Return what a view set's pixels depend on: sets of equal key have equal teacher targets."""
+    variant = view_set.seed if recipe.augmentation != "none" else None
+    return view_set.scene, view_set.frames, view_set.kept, variant
 
-    Method's fact sheet, section 3.3: one draw decides the mirror (p = .5); then per view a draw decides (p = .5) and a
-    second one gives the factor in [.8, 1.2]; results are clipped to [0, 1].
+
+def view_key(view_set: ViewSet, position: int, recipe: Recipe) -> ViewKey:
+    """Return what one view's pixels depend on; augmentation depends on the set and on the position in it."""
+    variant = view_set.seed * 1000 + position if recipe.augmentation != "none" else None
+    return view_set.scene, view_set.frames[position], variant
+
+
+def accesses(steps: Iterable[Sequence[Visit]], recipe: Recipe, *, teacher_once: bool) -> Iterator[Access]:
+    """List what teacher and student read in the steps, in order; the teacher once per view set, or in every visit."""
+    known: set[SetKey] = set()
+    for visit in (visit for visits in steps for visit in visits):
+        key = set_key(visit.view_set, recipe)
+        if not teacher_once or key not in known:
+            yield visit.view_set, tuple(range(len(visit.view_set.frames)))
+        known.add(key)
+        yield visit.view_set, visit.view_set.kept
+
+
+@torch.no_grad()
+def embed_in_chunks(
+    model: ReconstructionModel, images: Tensor, *, device: torch.device, layers: Sequence[int] | None = None
+) -> ViewTokens:
+    """Embed images (S, 3, H, W) a few at a time, so that memory does not grow with S except for the result.
+
+    On the CPU one at a time: then a view's tokens do not depend, in the last bit, on the views beside it.
     """
-    generator = random.Random(seed)
-    if generator.random() < 0.5:
-        images = images.flip(-1)
-    factors = [generator.uniform(0.8, 1.2) if generator.random() < 0.5 else 1.0 for _ in range(len(images))]
-    return (images * images.new_tensor(factors)[:, None, None, None]).clamp(0, 1)
+    chunk = views_per_chunk(device)
+    parts = [model.embed(part.to(device)[None], layers=layers) for part in images.split(chunk)]
+    return ViewTokens.join_views(parts)
+
+
+def views_per_chunk(device: torch.device) -> int:
+    """Return how many views are embedded together."""
+    return 1 if device.type == "cpu" else 8
 
 
 class ViewBank:
-    """Tokens of the images that view sets use, computed on demand and kept while pixels stay the same."""
+    """Tokens of the images that view sets use, computed on demand and kept until their last use."""
 
     def __init__(
         self,
@@ -54,45 +74,79 @@ class ViewBank:
         scenes: Sequence[SceneImages],
         recipe: Recipe,
         *,
-        device: torch.device,
+        planned: Sequence[Access],
+        engine: Engine,
         arithmetic: Callable[[], AbstractContextManager],
-        share: bool = True,
     ):
-        self.model, self.scenes, self.recipe = model, scenes, recipe
-        self.device, self.arithmetic, self.share = device, arithmetic, share
-        self._kept: dict[tuple[int, int, int | None], ViewTokens] = {}
+        self.model, self.recipe, self.engine, self.arithmetic = model, recipe, engine, arithmetic
+        self._cache = TensorCache(engine.cache_place, engine.device, folder=engine.cache_folder, half=engine.half_cache)
+        self._sizes: dict[int, tuple[tuple[int, int], tuple[int, int]]] = {}
+        self._uses = Counter(key for view_set, positions in planned for key in set(self._keys(view_set, positions)))
+        self._images = ImageQueue(scenes, list(self._requests(planned)), ahead=engine.images_ahead)
 
     def tokens(self, view_set: ViewSet, positions: Sequence[int]) -> ViewTokens:
         """Return the tokens (1, S, N, C) of some positions of a view set."""
-        if not self.share:
-            return self._embed(self._images(view_set)[list(positions)])
-        keys = [self._key(view_set, position) for position in range(len(view_set.frames))]
-        missing = [p for p, key in enumerate(keys) if key not in self._kept and key not in keys[:p]]
-        if missing:
-            embedded = self._embed(self._images(view_set)[missing])
-            for number, position in enumerate(missing):
-                self._kept[keys[position]] = embedded.select([number])
-        return ViewTokens.join_views([self._kept[keys[position]] for position in positions])
+        if not self.engine.share_prefix:
+            return self._embed(view_set, positions)
+        keys = self._keys(view_set, positions)
+        fresh = {key: position for key, position in zip(keys, positions, strict=True) if key not in self._cache}
+        found: dict[ViewKey, ViewTokens] = {}
+        if fresh:
+            embedded = self._embed(view_set, sorted(fresh.values()))
+            for number, position in enumerate(sorted(fresh.values())):
+                key = view_key(view_set, position, self.recipe)
+                found[key] = self._settled(key, embedded.select([number]))
+        result = ViewTokens.join_views([found[key] if key in found else self._kept(key) for key in keys])
+        self._count_down(keys)
+        return result
 
-    def forget(self) -> None:
-        """Drop everything, where a new epoch brings new pixels."""
-        self._kept.clear()
+    def close(self) -> None:
+        """Stop the background thread and drop everything."""
+        self._images.close()
+        self._cache.close()
 
-    def _key(self, view_set: ViewSet, position: int) -> tuple[int, int, int | None]:
-        augmented = self.recipe.augmentation != "none"
-        # Augmentation depends on the set and on the position in it, not only on the frame.
-        variant = view_set.seed * 1000 + position if augmented else None
-        return view_set.scene, view_set.frames[position], variant
+    def nbytes(self) -> int:
+        """Bytes of the tokens that are kept."""
+        return self._cache.nbytes()
 
-    def _images(self, view_set: ViewSet) -> Tensor:
-        images = self.scenes[view_set.scene].load(view_set.frames)
-        return released_augmentation(images, view_set.seed) if self.recipe.augmentation == "released" else images
+    def _keys(self, view_set: ViewSet, positions: Iterable[int]) -> list[ViewKey]:
+        return [view_key(view_set, position, self.recipe) for position in positions]
 
-    @torch.no_grad()
-    def _embed(self, images: Tensor) -> ViewTokens:
-        parts = []
-        for start in range(0, len(images), VIEWS_PER_CHUNK):
-            chunk = images[start : start + VIEWS_PER_CHUNK].to(self.device)
-            with self.arithmetic():
-                parts.append(self.model.embed(chunk[None], layers=self.model.spec.loss_layers))
-        return ViewTokens.join_views(parts)
+    def _requests(self, planned: Sequence[Access]) -> Iterator[tuple[int, tuple[int, ...]]]:
+        """List the images to load: those of every access, or, where tokens are kept, those not seen before."""
+        known: set[ViewKey] = set()
+        for view_set, positions in planned:
+            if self.engine.share_prefix:
+                fresh = {view_key(view_set, p, self.recipe): p for p in positions}
+                positions = sorted(p for key, p in fresh.items() if key not in known)
+                known |= fresh.keys()
+            if positions:
+                yield view_set.scene, tuple(view_set.frames[p] for p in positions)
+
+    def _embed(self, view_set: ViewSet, positions: Sequence[int]) -> ViewTokens:
+        images = self._images.take(view_set.scene, [view_set.frames[p] for p in positions])
+        if self.recipe.augmentation == "released":
+            images = released_augmentation(images, view_set.seed, positions)
+        with self.arithmetic():
+            return embed_in_chunks(self.model, images, device=self.engine.device, layers=self.model.spec.loss_layers)
+
+    def _settled(self, key: ViewKey, view: ViewTokens) -> ViewTokens:
+        """Keep a view that will be read again, and return it as it will be read then."""
+        self._sizes[key[0]] = view.image_hw, view.grid_hw
+        tensors = {"tokens": view.tokens, **view.extra}
+        if self._uses[key] > 1:
+            self._cache.put(key, tensors)
+        return self._view(key, self._cache.rounded(tensors))
+
+    def _kept(self, key: ViewKey) -> ViewTokens:
+        return self._view(key, self._cache.get(key))
+
+    def _view(self, key: ViewKey, tensors: dict[str, Tensor]) -> ViewTokens:
+        image_hw, grid_hw = self._sizes[key[0]]
+        return ViewTokens(tokens=tensors.pop("tokens"), extra=tensors, image_hw=image_hw, grid_hw=grid_hw)
+
+    def _count_down(self, keys: Iterable[ViewKey]) -> None:
+        for key in set(keys):
+            self._uses[key] -= 1
+            if self._uses[key] <= 0:
+                self._cache.drop(key)

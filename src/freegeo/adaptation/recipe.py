@@ -1,6 +1,6 @@
 """Named settings of an adaptation run: the paper's, the released ones, and ours for one user's photos.
 
-Sources: the method's fact sheet, sections 2 (`paper`, `scene`) and 3 (`released-*`, with the per-dataset tables of 3.4).
+Sources: the method's fact sheet, sections 2 (`paper`, `scene`) and 3 (`released-*`; the per-dataset tables are 3.4).
 """
 
 from __future__ import annotations
@@ -73,15 +73,16 @@ class Recipe:
             if not getattr(self, name) > 0:
                 raise UserError(f"recipe setting {name} must be positive, got {getattr(self, name)}.")
         if (self.steps is None) == (self.epochs is None) or (self.steps or self.epochs or 0) < 1:
-            raise UserError("a recipe needs either steps or epochs, at least 1.")
+            raise UserError("a recipe needs either --steps or --epochs, not both, and at least 1.")
 
     def changed(self, **changes) -> Recipe:
-        """Return the recipe with some settings replaced; those given as None stay. Setting steps unsets epochs."""
+        """Return the recipe with some settings replaced; those given as None stay.
+
+        Setting steps unsets epochs and the reverse; setting the rank sets alpha to it, unless that is given too.
+        """
         given = {name: value for name, value in changes.items() if value is not None}
-        if "steps" in given:
-            given.setdefault("epochs", None)
-        if "epochs" in given and given["epochs"] is not None:
-            given["steps"] = None
+        if ("steps" in given) != ("epochs" in given):
+            given["epochs" if "steps" in given else "steps"] = None
         if "rank" in given:
             given.setdefault("alpha", given["rank"])
         return replace(self, **given)
@@ -177,7 +178,7 @@ def _row(
     if dataset == "procedural" and spec is not None:
         # Generated rooms are no published dataset; 150 steps of batch 4 over 10 to 100 rooms was measured to suffice.
         return DatasetSettings(sets=4, seeds=4, epochs=3, lr=spec.adaptation.scene_lr, final_lr=1e-6)
-    if dataset not in table:
+    if dataset is None or dataset not in table:
         known = ", ".join(table)
         raise UserError(f"recipe '{name}' has settings per dataset: choose --dataset from {known}, or --recipe scene.")
     return table[dataset]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -10,20 +11,40 @@ import torch
 from torch import Tensor
 
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.bank import ViewBank
+from freegeo.adaptation.bank import SetKey, ViewBank, set_key
+from freegeo.adaptation.cache import TensorCache
+from freegeo.adaptation.engine import Engine
 from freegeo.adaptation.losses import (
     AnchorFeatures,
     LossConfig,
+    Precision,
     StepDraws,
     TeacherTargets,
     anchor_features,
+    choose_precision,
     draw_tokens,
+    teacher_spread,
     teacher_targets,
 )
+from freegeo.adaptation.recipe import Recipe
 from freegeo.adaptation.views import ViewSet, Visit
 
 Level = tuple[Tensor, Tensor]
 DRAW_SEED_STRIDE = 1_000_003
+SPREAD_HEADROOM = 2.0
+"""How far the student's softmax inputs may spread beyond the teacher's, where they are measured once per view set."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """What the loss compares the student of a visit with."""
+
+    targets: TeacherTargets
+    draws: StepDraws
+    precision: Precision | None
+    """How the all-pairs KL is computed; None: the loss measures it, which costs a host read."""
+    views: int
+    """Views that the teacher saw."""
 
 
 def step_draws(config: LossConfig, level: Level, view_set: ViewSet, *, seed: int, step: int) -> StepDraws:
@@ -40,15 +61,23 @@ def step_draws(config: LossConfig, level: Level, view_set: ViewSet, *, seed: int
     return draws.to(patch.device)
 
 
+def anchors_are_smaller(config: LossConfig, cross: Level, visits: int) -> bool:
+    """Say whether the anchors of all visits take less room than all views at the cross layer."""
+    patch, special = cross
+    references = min(config.num_reference, patch.shape[2] + (special.shape[2] if config.cross_tokens == "all" else 0))
+    per_visit = references * config.num_anchors * patch.shape[-1] * (2 if config.separate_draws else 1)
+    return per_visit * visits <= patch.numel() + special.numel()
+
+
 @dataclass
 class _Entry:
-    """One view set's targets: kept views, and the anchors of every step that will ask for them."""
+    """What is known of one view set beside its tensors."""
 
-    kept: Mapping[int, Level]
+    left: Counter[int]
+    """Visits still to come, by step; a small scene may give one set several times in a step."""
     draws: dict[int, StepDraws] = field(default_factory=dict)
-    anchors: dict[int, AnchorFeatures] = field(default_factory=dict)
-    cross: Level | None = None
-    """All N views at the cross layer, where that is smaller than the anchors of all steps."""
+    anchors_kept: bool = True
+    """Anchors are kept per step; otherwise all views at the cross layer."""
 
 
 class TeacherBank:
@@ -58,51 +87,139 @@ class TeacherBank:
         self,
         adapter: Adapter,
         bank: ViewBank,
-        config: LossConfig,
+        recipe: Recipe,
         visits: Sequence[Visit],
         *,
         seed: int,
+        engine: Engine,
         arithmetic: Callable[[], AbstractContextManager],
-        keep: bool = True,
     ):
-        self.adapter, self.bank, self.config = adapter, bank, config
-        self.seed, self.arithmetic, self.keep = seed, arithmetic, keep
-        self._entries: dict[ViewSet, _Entry] = {}
-        self._steps: dict[ViewSet, list[int]] = {}
+        self.adapter, self.bank, self.recipe = adapter, bank, recipe
+        self.config, self.seed, self.engine, self.arithmetic = recipe.loss, seed, engine, arithmetic
+        self._cache = TensorCache(engine.cache_place, engine.device, folder=engine.cache_folder, half=engine.half_cache)
+        self._entries: dict[SetKey, _Entry] = {}
+        self._precisions: dict[SetKey, Precision | None] = {}
+        self._steps: dict[SetKey, list[int]] = {}
         for visit in visits:
-            self._steps.setdefault(visit.view_set, []).append(visit.step)
+            self._steps.setdefault(set_key(visit.view_set, recipe), []).append(visit.step)
 
-    def targets(self, visit: Visit) -> tuple[TeacherTargets, StepDraws]:
+    def targets(self, visit: Visit) -> Comparison:
         """Return what the loss compares the student with in this visit, and the tokens it draws."""
-        entry = self._entries.get(visit.view_set)
-        if entry is None:
-            entry = self._compute(visit)
-            if self.keep:
-                self._entries[visit.view_set] = entry
+        key = set_key(visit.view_set, self.recipe)
+        if not self.engine.cache_teacher:
+            return self._once(visit)
+        if key not in self._entries:
+            self._compute(key, visit)
+        entry = self._entries[key]
         draws = entry.draws[visit.step]
-        if entry.cross is None:
-            return TeacherTargets(kept=entry.kept, anchors=entry.anchors[visit.step]), draws
-        anchors = anchor_features(entry.cross, visit.view_set.kept, draws, self.config)
-        return TeacherTargets(kept=entry.kept, anchors=anchors), draws
+        kept = _levels(self._cache.get((key, "kept")))
+        if entry.anchors_kept:
+            anchors = _anchors(self._cache.get((key, visit.step)))
+        else:
+            cross = self._cache.get((key, "cross"))
+            anchors = anchor_features((cross["patch"], cross["special"]), visit.view_set.kept, draws, self.config)
+        self._count_down(key, visit.step)
+        return self._comparison(visit, TeacherTargets(kept=kept, anchors=anchors), draws)
 
-    def forget(self) -> None:
-        """Drop everything, where a new epoch brings new pixels."""
-        self._entries.clear()
+    def close(self) -> None:
+        """Drop everything."""
+        self._cache.close()
+
+    def nbytes(self) -> int:
+        """Bytes of the targets that are kept."""
+        return self._cache.nbytes()
+
+    def _count_down(self, key: SetKey, step: int) -> None:
+        left = self._entries[key].left
+        left[step] -= 1
+        if not left[step]:
+            self._cache.drop((key, step))
+        if not left.total():
+            for part in ("kept", "cross"):
+                self._cache.drop((key, part))
+            del self._entries[key]
 
     @torch.no_grad()
-    def _compute(self, visit: Visit) -> _Entry:
-        view_set, model = visit.view_set, self.adapter.model
+    def _features(self, view_set: ViewSet) -> Mapping[int, Level]:
         tokens = self.bank.tokens(view_set, range(len(view_set.frames)))
+        model = self.adapter.model
         with self.adapter.off(), self.arithmetic():
-            levels = model.aggregate(tokens, layers=model.spec.loss_layers, reference="first").levels
+            return model.aggregate(tokens, layers=model.spec.loss_layers, reference="first").levels
+
+    def _once(self, visit: Visit) -> Comparison:
+        levels = self._features(visit.view_set)
+        draws = self._draws(levels, visit.view_set, visit.step)
+        return self._comparison(visit, teacher_targets(levels, visit.view_set.kept, draws, self.config), draws)
+
+    def _compute(self, key: SetKey, visit: Visit) -> None:
+        """Run the teacher and keep compact copies, so that the full features of all views can go."""
+        levels, kept_positions = self._features(visit.view_set), visit.view_set.kept
         cross = levels[max(levels)]
-        steps = self._steps[view_set] if self.keep else [visit.step]
-        draws = {step: step_draws(self.config, cross, view_set, seed=self.seed, step=step) for step in steps}
-        first = teacher_targets(levels, view_set.kept, draws[visit.step], self.config)
-        # Compact copies, so that the full features of all views can go.
-        kept = {layer: (patch.clone(), special.clone()) for layer, (patch, special) in first.kept.items()}
-        per_step = first.anchors.angle.numel() * (1 if draws[visit.step].shared else 2)
-        if per_step * len(steps) > sum(part.numel() for part in cross):
-            return _Entry(kept=kept, draws=draws, cross=cross)
-        anchors = {step: anchor_features(cross, view_set.kept, draws[step], self.config) for step in steps}
-        return _Entry(kept=kept, draws=draws, anchors=anchors)
+        # A resumed run needs nothing for the steps that are done.
+        left = Counter(step for step in self._steps[key] if step >= visit.step)
+        steps = sorted(left)
+        draws = {step: self._draws(levels, visit.view_set, step) for step in steps}
+        entry = _Entry(left=left, draws=draws, anchors_kept=anchors_are_smaller(self.config, cross, len(steps)))
+        first = teacher_targets(levels, kept_positions, draws[visit.step], self.config)
+        named = first.tensors()
+        self._cache.put((key, "kept"), {name: named[name] for name in named if name.startswith("kept.")})
+        if not entry.anchors_kept:
+            self._cache.put((key, "cross"), {"patch": cross[0], "special": cross[1]})
+        for step in steps if entry.anchors_kept else ():
+            found = anchor_features(cross, kept_positions, draws[step], self.config)
+            shared = {} if found.distance is found.angle else {"distance": found.distance}
+            self._cache.put((key, step), {"angle": found.angle, **shared})
+        self._entries[key] = entry
+
+    def _draws(self, levels: Mapping[int, Level], view_set: ViewSet, step: int) -> StepDraws:
+        return step_draws(self.config, levels[max(levels)], view_set, seed=self.seed, step=step)
+
+    def _comparison(self, visit: Visit, targets: TeacherTargets, draws: StepDraws) -> Comparison:
+        key = set_key(visit.view_set, self.recipe)
+        if key not in self._precisions:
+            self._precisions[key] = self._precision(targets, draws)
+        return Comparison(
+            targets=targets, draws=draws, precision=self._precisions[key], views=len(visit.view_set.frames)
+        )
+
+    def _precision(self, targets: TeacherTargets, draws: StepDraws) -> Precision | None:
+        """On the CPU nothing waits for a host read, so every step measures; elsewhere the teacher's stands for all."""
+        if self.engine.device.type == "cpu" or not self.config.uses_distances or self.config.pairing != "all":
+            return None
+        return choose_precision(float(teacher_spread(targets, draws, self.config)), headroom=SPREAD_HEADROOM)
+
+
+def _levels(tensors: Mapping[str, Tensor]) -> dict[int, Level]:
+    layers = sorted({int(name.split(".")[1]) for name in tensors})
+    return {layer: (tensors[f"kept.{layer}.patch"], tensors[f"kept.{layer}.special"]) for layer in layers}
+
+
+def _anchors(tensors: Mapping[str, Tensor]) -> AnchorFeatures:
+    return AnchorFeatures(angle=tensors["angle"], distance=tensors.get("distance", tensors["angle"]))
+
+
+def stacked(comparisons: Sequence[Comparison]) -> Comparison:
+    """Join the comparisons of view sets of equal shape, visited in one step, into one batch."""
+    if len(comparisons) == 1:
+        return comparisons[0]
+    targets = [comparison.targets for comparison in comparisons]
+    kept = {
+        layer: tuple(torch.cat([one.kept[layer][part] for one in targets]) for part in (0, 1))
+        for layer in targets[0].kept
+    }
+    angle = torch.cat([one.anchors.angle for one in targets])
+    shared = targets[0].anchors.distance is targets[0].anchors.angle
+    distance = angle if shared else torch.cat([one.anchors.distance for one in targets])
+    return Comparison(
+        targets=TeacherTargets(kept=kept, anchors=AnchorFeatures(angle=angle, distance=distance)),
+        draws=comparisons[0].draws,
+        precision=_safest([comparison.precision for comparison in comparisons]),
+        views=comparisons[0].views,
+    )
+
+
+def _safest(precisions: Sequence[Precision | None]) -> Precision | None:
+    for precision in ("direct", "float64", "float32"):
+        if precision in precisions:
+            return precision
+    return None

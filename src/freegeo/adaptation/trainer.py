@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -15,32 +14,21 @@ import torch
 from torch import Tensor
 
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.bank import SceneImages, ViewBank
+from freegeo.adaptation.bank import ViewBank, accesses
+from freegeo.adaptation.engine import Engine
+from freegeo.adaptation.images import SceneImages
 from freegeo.adaptation.losses import adaptation_loss, require_finite
 from freegeo.adaptation.recipe import Recipe
-from freegeo.adaptation.teacher import TeacherBank
+from freegeo.adaptation.state import read_state, run_identity, write_state
+from freegeo.adaptation.teacher import Comparison, TeacherBank, stacked
 from freegeo.adaptation.views import Visit, schedule
-from freegeo.errors import UserError
 from freegeo.models.api import ReconstructionModel
-from freegeo.models.precision import Precision, autocast
-from freegeo.storage import write_tensors
+from freegeo.models.precision import autocast, cast_linears
+from freegeo.types import ViewTokens
 
 SAVE_EVERY_S = 30.0
 STATE_FILE = "adapting.safetensors"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Engine:
-    """How a run is computed; nothing here changes the result beyond rounding."""
-
-    device: torch.device = torch.device("cpu")
-    precision: Precision = "fp32"
-    share_prefix: bool = True
-    """Embed every image once, instead of in every pass."""
-    cache_teacher: bool = True
-    """Compute the teacher once per view set, instead of in every step."""
-    recompute_blocks: bool = False
-    """Activation checkpointing: less memory, one more student forward."""
+GRADIENT = "gradient"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,26 +97,63 @@ def adapt(
     adapter = Adapter.attach(
         part, rank=recipe.rank, alpha=recipe.alpha, dropout=recipe.dropout, generator=_generator(seed)
     )
-    run = _Run(adapter, scenes, recipe, steps, seed, engine)
     result = Adapted(adapter=adapter, recipe=recipe, seed=seed)
-    first = run.restore(resume_in, result)
-    saved_at = time.monotonic()
-    try:
-        for step in range(first, len(steps)):
+    with ExitStack() as stack:
+        stack.callback(adapter.detach)
+        run = _Run(result, scenes, steps, engine, resume_in)
+        stack.callback(run.close)
+        saved_at = time.monotonic()
+        for step in range(run.first, len(steps)):
             terms = run.step(step)
-            result.curve.append(terms)  # type: ignore[arg-type]
             on_step(Progress(step=step, steps=len(steps), epoch=steps[step][0].epoch, terms=terms))
             if step + 1 == len(steps) or steps[step + 1][0].epoch != steps[step][0].epoch:
+                run.watch.check()
                 on_epoch(steps[step][0].epoch, adapter)
             if resume_in is not None and time.monotonic() - saved_at > SAVE_EVERY_S:
-                run.save(resume_in, step + 1, result)
+                run.save(step + 1, elapsed=time.monotonic() - started)
                 saved_at = time.monotonic()
-    except BaseException:
-        adapter.detach()
-        raise
+        stack.pop_all()
+        run.close()
     result.curve = _floats(result.curve)
     result.seconds += time.monotonic() - started
     return result
+
+
+class _Watch:
+    """Stops a run whose loss or gradient is not finite, before the optimiser changes anything.
+
+    On the CPU the numbers are read at once. Elsewhere the device itself leaves the update out, and the host reads the
+    verdict of a step after it has queued the next one, so that the device never waits for it.
+    """
+
+    def __init__(self, *, at_once: bool):
+        self.at_once = at_once
+        self._pending: tuple[int, dict[str, Tensor], Tensor, torch.cuda.Event | None] | None = None
+
+    def see(self, step: int, terms: dict[str, Tensor]) -> None:
+        """Look at the scalars of a step; raises FreeGeoError that names the first one that is not finite."""
+        if self.at_once:
+            require_finite(terms, step=step)
+            return
+        finite = torch.stack([term.isfinite().all() for term in terms.values()])
+        on_cuda = finite.device.type == "cuda"
+        verdict = torch.empty(finite.shape, dtype=torch.bool, pin_memory=on_cuda).copy_(finite, non_blocking=True)
+        event = torch.cuda.Event() if on_cuda else None
+        if event is not None:
+            event.record()
+        self.check()
+        self._pending = step, terms, verdict, event
+
+    def check(self) -> None:
+        """Read what is still unread."""
+        if self._pending is None:
+            return
+        step, terms, verdict, event = self._pending
+        self._pending = None
+        if event is not None:
+            event.synchronize()
+        if not verdict.all():
+            require_finite(terms, step=step)
 
 
 class _Run:
@@ -136,63 +161,91 @@ class _Run:
 
     def __init__(
         self,
-        adapter: Adapter,
+        result: Adapted,
         scenes: Sequence[SceneImages],
-        recipe: Recipe,
         steps: list[list[Visit]],
-        seed: int,
         engine: Engine,
+        folder: Path | None,
     ):
-        self.adapter, self.recipe, self.steps, self.seed, self.engine = adapter, recipe, steps, seed, engine
+        self.result, self.steps, self.engine, self.folder = result, steps, engine, folder
+        self.adapter, self.recipe, self.seed = result.adapter, result.recipe, result.seed
         self.arithmetic = partial(autocast, engine.device, engine.precision)
-        self.bank = ViewBank(
-            adapter.model, scenes, recipe, device=engine.device, arithmetic=self.arithmetic, share=engine.share_prefix
-        )
-        visits = [visit for visits in steps for visit in visits]
-        self.teacher = TeacherBank(
-            adapter, self.bank, recipe.loss, visits, seed=seed, arithmetic=self.arithmetic, keep=engine.cache_teacher
-        )
-        self.optimiser = torch.optim.AdamW(adapter.parameters(), lr=recipe.lr, weight_decay=recipe.weight_decay)
+        if engine.half_weights:
+            cast_linears(self.adapter.model, engine.precision)
+        parameters = self.adapter.parameters()
+        self.optimiser = torch.optim.AdamW(parameters, lr=0.0, weight_decay=self.recipe.weight_decay, fused=True)
         self.scaler = torch.amp.GradScaler(engine.device.type, enabled=engine.precision == "fp16")
-        self.epoch = 0
+        self.watch = _Watch(at_once=engine.device.type == "cpu")
+        self.identity = run_identity(self.adapter.model.spec.name, scenes, self.recipe, self.seed)
+        self.first = self._restore()
+        ahead = steps[self.first :]
+        self.bank = ViewBank(
+            self.adapter.model,
+            scenes,
+            self.recipe,
+            planned=list(accesses(ahead, self.recipe, teacher_once=engine.cache_teacher)),
+            engine=engine,
+            arithmetic=self.arithmetic,
+        )
+        visits = [visit for visits in ahead for visit in visits]
+        self.teacher = TeacherBank(
+            self.adapter, self.bank, self.recipe, visits, seed=self.seed, engine=engine, arithmetic=self.arithmetic
+        )
 
     def step(self, step: int) -> dict[str, Tensor]:
-        """Compare the student with the teacher on the step's view sets and update the adapter; return the mean terms."""
+        """Compare the student with the teacher on the step's view sets, update the adapter, return the mean terms."""
         visits = self.steps[step]
-        self._enter_epoch(visits[0].epoch)
-        self._set_rate(step)
         self.optimiser.zero_grad(set_to_none=True)
-        per_set = []
+        parts = []
         with self._training(step):
-            for visit in visits:
-                targets, draws = self.teacher.targets(visit)
-                student = self._student(visit)
-                loss, terms = adaptation_loss(student, targets, draws, self.recipe.loss)
-                self.scaler.scale(loss / len(visits)).backward()
-                per_set.append(terms)
-        terms = {name: torch.stack([one[name] for one in per_set]).mean() for name in per_set[0]}
-        require_finite(terms, step=step)
-        self.scaler.unscale_(self.optimiser)
-        torch.nn.utils.clip_grad_norm_(self.adapter.parameters(), self.recipe.clip)
-        self.scaler.step(self.optimiser)
-        self.scaler.update()
+            for tokens, comparison in self._batches(visits):
+                share = len(tokens.tokens) / len(visits)
+                loss, terms = self._compare(tokens, comparison)
+                # A loss that is not finite shall leave no finite gradient behind.
+                factor = torch.where(loss.detach().isfinite(), share, torch.nan)
+                self.scaler.scale(loss * factor).backward()
+                parts.append({name: term * share for name, term in terms.items()})
+        terms = {name: torch.stack([part[name] for part in parts]).sum() for name in parts[0]}
+        self._update(step, terms)
+        self.result.curve.append(terms)  # type: ignore[arg-type]
         return terms
 
-    def _student(self, visit: Visit) -> dict[int, tuple[Tensor, Tensor]]:
-        tokens = self.bank.tokens(visit.view_set, visit.view_set.kept)
+    def _batches(self, visits: Sequence[Visit]) -> Iterator[tuple[ViewTokens, Comparison]]:
+        """Yield student tokens and targets; successive view sets of equal shape share a batch up to the micro-batch."""
+        waiting: list[tuple[ViewTokens, Comparison]] = []
+        for visit in visits:
+            comparison = self.teacher.targets(visit)
+            tokens = self.bank.tokens(visit.view_set, visit.view_set.kept)
+            if waiting and (
+                len(waiting) == self.engine.micro_batch or _shape(waiting[0]) != _shape((tokens, comparison))
+            ):
+                yield _joined(waiting)
+                waiting = []
+            waiting.append((tokens, comparison))
+        yield _joined(waiting)
+
+    def _compare(self, tokens: ViewTokens, comparison: Comparison) -> tuple[Tensor, dict[str, Tensor]]:
         model = self.adapter.model
         with self.arithmetic():
-            return dict(model.aggregate(tokens, layers=model.spec.loss_layers, reference="first").levels)
+            levels = dict(model.aggregate(tokens, layers=model.spec.loss_layers, reference="first").levels)
+        return adaptation_loss(
+            levels, comparison.targets, comparison.draws, self.recipe.loss, precision=comparison.precision
+        )
 
-    def _enter_epoch(self, epoch: int) -> None:
-        if epoch != self.epoch and self.recipe.redraw:
-            self.bank.forget()
-            self.teacher.forget()
-        self.epoch = epoch
-
-    def _set_rate(self, step: int) -> None:
+    def _update(self, step: int, terms: dict[str, Tensor]) -> None:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(step, len(self.steps), self.recipe)
+        self.scaler.unscale_(self.optimiser)
+        norm = torch.nn.utils.clip_grad_norm_(self.adapter.parameters(), self.recipe.clip)
+        if self.scaler.is_enabled():
+            # The scaler meets gradients that overflow by leaving the step out and scaling less; that is no failure.
+            self.watch.see(step, terms)
+        else:
+            self.watch.see(step, {**terms, GRADIENT: norm.detach()})
+            if not self.watch.at_once:
+                self.optimiser.found_inf = (~norm.isfinite()).float()
+        self.scaler.step(self.optimiser)
+        self.scaler.update()
 
     @contextmanager
     def _training(self, step: int) -> Iterator[None]:
@@ -208,45 +261,47 @@ class _Run:
             model.eval()
             model.set_recompute(False)
 
-    def save(self, folder: Path, next_step: int, result: Adapted) -> None:
-        """Write parameters, optimiser and loss curve so that `restore` goes on with `next_step`."""
-        tensors = {}
-        for name, parameter in self.adapter.named_parameters().items():
-            tensors[name] = parameter
-            for key, value in self.optimiser.state[parameter].items():
-                tensors[f"{name}|{key}"] = value
-        result.curve = _floats(result.curve)
+    def save(self, next_step: int, *, elapsed: float) -> None:
+        """Write a state that goes on with `next_step`."""
+        assert self.folder is not None
+        self.watch.check()
+        self.result.curve = _floats(self.result.curve)
         about = {
+            "identity": self.identity,
             "next_step": next_step,
-            "curve": result.curve,
-            "seconds": result.seconds,
+            "curve": self.result.curve,
+            "seconds": self.result.seconds + elapsed,
             "scaler": self.scaler.state_dict(),
         }
-        write_tensors(folder / STATE_FILE, tensors, {"run": json.dumps(about)})
+        write_state(self.folder / STATE_FILE, self.adapter, self.optimiser, about)
 
-    def restore(self, folder: Path | None, result: Adapted) -> int:
+    def close(self) -> None:
+        """Drop tokens, targets and the background thread."""
+        self.bank.close()
+        self.teacher.close()
+
+    def _restore(self) -> int:
         """Take over a saved state, if there is one, and return the step to go on with."""
-        path = None if folder is None else folder / STATE_FILE
-        if path is None or not path.is_file():
+        if self.folder is None:
             return 0
-        from safetensors import safe_open
-
-        with safe_open(path, framework="pt") as file:
-            about = json.loads(file.metadata()["run"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        named = self.adapter.named_parameters()
-        if not set(named) <= set(tensors):
-            raise UserError(f"{path}: this state belongs to another run. Remove it, or choose another output folder.")
-        self.adapter.load({name: tensors[name] for name in named})
-        for name, parameter in named.items():
-            state = {key.partition("|")[2]: value for key, value in tensors.items() if key.startswith(f"{name}|")}
-            # AdamW keeps its step counter on the CPU.
-            self.optimiser.state[parameter] = {
-                key: value if key == "step" else value.to(parameter.device) for key, value in state.items()
-            }
+        about = read_state(self.folder / STATE_FILE, self.adapter, self.optimiser, self.identity)
+        if about is None:
+            return 0
         self.scaler.load_state_dict(about["scaler"])
-        result.curve, result.seconds = about["curve"], about["seconds"]
+        self.result.curve, self.result.seconds = about["curve"], about["seconds"]
         return about["next_step"]
+
+
+def _shape(part: tuple[ViewTokens, Comparison]) -> tuple:
+    tokens, comparison = part
+    # Draws depend on the numbers of views and tokens only, so sets of equal shape share those of the step.
+    return tokens.tokens.shape, tokens.image_hw, comparison.targets.anchors.angle.shape, comparison.views
+
+
+def _joined(parts: Sequence[tuple[ViewTokens, Comparison]]) -> tuple[ViewTokens, Comparison]:
+    if len(parts) == 1:
+        return parts[0]
+    return ViewTokens.stack([tokens for tokens, _ in parts]), stacked([comparison for _, comparison in parts])
 
 
 def _generator(seed: int) -> torch.Generator:

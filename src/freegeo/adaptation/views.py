@@ -41,8 +41,9 @@ def draw_frames(count: int, views: int, seed: int, *, repeat: bool) -> tuple[int
 
 
 def kept_positions(views: int, keep: tuple[int, ...] | None) -> tuple[int, ...]:
-    """Return the student's positions: the recipe's where they fit, else every second view."""
-    return keep if keep is not None and keep[-1] < views else tuple(range(0, views, 2))
+    """Return the student's positions among `views`: `keep` where it fits and holds a view out, else every second."""
+    fits = keep is not None and keep[-1] < views and len(keep) < views
+    return keep if fits else tuple(range(0, views, 2))
 
 
 def view_sets(frame_counts: list[int], recipe: Recipe, epoch: int = 0) -> list[ViewSet]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from freegeo.cli import console
+from freegeo.cli.files import FileOptions
 from freegeo.cli.options import ModelOptions, OutputOptions
 from freegeo.storage import check_folder, run_folder
 
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from freegeo.pipeline import Hooks, Job
     from freegeo.types import PhotoLike
 
+DEFAULT_FILES = FileOptions()
 FILES = {
     "report.html": "the page to look at first",
     "prediction.npz": "depth, confidence, cameras",
@@ -26,6 +26,10 @@ FILES = {
     "adapter": "the adapter (peft format)",
     "points.ply": "coloured points",
     "scene.glb": "points and camera frusta",
+    "mesh.ply": "surface",
+    "colmap": "COLMAP model with tracks",
+    "transforms.json": "nerfstudio cameras",
+    "depth": "16-bit depth images",
     "reconstruction.json": "settings, timings, versions, licence of the weights",
 }
 
@@ -64,33 +68,56 @@ def run_job(
     command: str,
     recipe: Recipe | None,
     adapter: Path | None = None,
+    files: FileOptions = DEFAULT_FILES,
     extra_settings: dict[str, Any] | None = None,
-) -> Job | None:
-    """Carry out a job in its output folder and say what came out; None when the folder holds the finished result."""
+    after: Callable[[Job], None] = lambda job: None,
+) -> None:
+    """Carry out a job in its output folder and say what came out; a finished folder is left alone.
+
+    `after` writes more before the folder counts as finished.
+    """
     from freegeo.pipeline import Job, require_enough_photos, settings_of
 
     if recipe is not None:
         require_enough_photos(photos)
+    batch = model.preprocess(photos)
     settings = settings_of(
         recipe,
         command=command,
-        photos=[photo.name for photo in photos],
-        adapter=None if adapter is None else str(adapter.resolve()),
+        photos=list(batch.names),
+        photo_contents=batch.digest(),
+        adapter=None if adapter is None else adapter_identity(adapter),
         **model_options.settings(model),
+        **files.settings(),
         **(extra_settings or {}),
     )
     check_folder(output.output, settings, overwrite=output.overwrite)
-    batch = model.preprocess(photos)
+    masks = files.checked_masks(photos)
     with run_folder(output.output, settings, overwrite=output.overwrite) as folder, progress_hooks() as hooks:
         if folder.finished:
-            console.say(f"{output.output}: already finished on {folder.finished_at}; nothing to do.")
-            return None
+            say_finished(output.output, folder.finished_at)
+            return
         job = Job(
             model=model, batch=batch, folder=folder, recipe=recipe, adapter=adapter, seed=model_options.seed,
-            engine=model_options.engine(), hooks=hooks,
+            engine=model_options.engine(), hooks=hooks, reference=model_options.reference,
+            command=console.command_line(), after=after, formats=files.formats, filters=files.filters.settings(),
+            masks=masks,
         )  # fmt: skip
         describe(job.run(), output.output)
-        return job
+
+
+def adapter_identity(folder: Path) -> dict[str, str]:
+    """Return what tells an adapter from another one; UserError when the folder holds none."""
+    from freegeo.adaptation.peft_files import WEIGHTS, read_peft
+    from freegeo.models.checkpoints import fingerprint
+
+    read_peft(folder)
+    return {"folder": str(folder.resolve()), "weights": fingerprint(folder / WEIGHTS)}
+
+
+def say_finished(folder: Path, finished_at: str | None) -> None:
+    """Say that there is nothing left to do."""
+    console.say(f"{folder}: already finished on {finished_at}; nothing to do.")
 
 
 def describe(summary: dict[str, Any], folder: Path) -> None:
@@ -102,8 +129,3 @@ def describe(summary: dict[str, Any], folder: Path) -> None:
     console.say("seconds: " + ", ".join(f"{name} {value:.1f}" for name, value in summary["seconds"].items()))
     console.say(f"licence of the weights: {summary['licence_of_weights']}")
     console.written(folder, FILES)
-
-
-def command_line() -> str:
-    """Return the command as it was typed, for files that say how they were made."""
-    return shlex.join(["freegeo", *sys.argv[1:]])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from freegeo.cli.jobs import run_job
+from freegeo.cli.files import FileOptions
+from freegeo.cli.jobs import DEFAULT_FILES, run_job
 from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions
 from freegeo.cli.sources import load_source
 
@@ -16,6 +17,7 @@ def reconstruct(
     output: OutputOptions,
     model: ModelOptions = DEFAULT_MODEL,
     photos: PhotoOptions = DEFAULT_PHOTOS,
+    files: FileOptions = DEFAULT_FILES,
     adapter: Path | None = None,
 ) -> None:
     """Reconstruct photos; one photo is enough.
@@ -29,4 +31,4 @@ def reconstruct(
     """
     found = load_source(sources, photos.max_views)
     loaded = model.load()
-    run_job(found, loaded, model, output, command="reconstruct", recipe=None, adapter=adapter)
+    run_job(found, loaded, model, output, command="reconstruct", recipe=None, adapter=adapter, files=files)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from freegeo.cli.jobs import run_job
+from freegeo.cli.files import FileOptions
+from freegeo.cli.jobs import DEFAULT_FILES, run_job
 from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source
 
@@ -15,6 +16,7 @@ def run(
     model: ModelOptions = DEFAULT_MODEL,
     recipe: RecipeOptions = DEFAULT_RECIPE,
     photos: PhotoOptions = DEFAULT_PHOTOS,
+    files: FileOptions = DEFAULT_FILES,
     adapt: bool = True,
 ) -> None:
     """Reconstruct photos with a model adapted to them.
@@ -31,4 +33,4 @@ def run(
     found = load_source(sources, photos.max_views)
     loaded = model.load()
     plan = recipe.build(loaded.spec) if adapt else None
-    run_job(found, loaded, model, output, command="run", recipe=plan)
+    run_job(found, loaded, model, output, command="run", recipe=plan, files=files)

@@ -1,0 +1,191 @@
+"""What a model's passes occupy, from the shapes of its linear layers (method's fact sheet, section 6.4).
+
+Counted are the arrays that the transformer block of `models.transformer` keeps for its backward pass with an adapter on
+its linears; a plug-in with other blocks gets the same estimate from the linears it names. Bytes throughout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from freegeo.models.api import ReconstructionModel
+from freegeo.models.precision import Precision, encoder
+
+WIDE = 4
+"""Bytes of a float32: the residual stream, norms, features, losses, trained parameters."""
+
+
+def narrow(precision: Precision) -> int:
+    """Bytes of an element that matrix products read and write."""
+    return WIDE if precision == "fp32" else 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape:
+    """The numbers of a model that memory depends on."""
+
+    width: int
+    heads: int
+    """Upper bound, from heads at least 64 wide; only statistics of attention depend on it."""
+    blocks: int
+    """Adapted blocks: attention and feed-forward."""
+    hidden: int
+    """Width between the two linears of the feed-forward layer."""
+    gated: bool
+    linear_parameters: int
+    """Parameters of the encoder's linears, which may be stored in half precision."""
+    adapted_parameters: int
+    """Parameters of the linears that an adapter sits on."""
+    other_parameters: int
+    channels: int
+    """Feature channels of the losses."""
+    special: int
+
+
+def shape_of(model: ReconstructionModel) -> Shape:
+    """Read a model's shape off its adapter targets; the model may be on the meta device, and may carry an adapter."""
+    part = model.adaptable()
+    linears = [_base(part.get_submodule(name)) for name in part.adapter_targets()]
+    attention = [linear for linear in linears if linear.out_features == 3 * linear.in_features]
+    width = attention[0].in_features
+    contraction = [linear for linear in linears if linear.out_features == width and linear.in_features != width]
+    expansion = [linear for linear in linears if linear.in_features == width and linear.out_features > width]
+    hidden = contraction[0].in_features if contraction else width
+    casts = {
+        id(parameter): parameter.numel()
+        for module in encoder(part).modules()
+        if isinstance(module, nn.Linear | nn.Conv2d) and not _trained(module)
+        for parameter in module.parameters(recurse=False)
+    }
+    every = sum(parameter.numel() for parameter in model.parameters() if not parameter.requires_grad)
+    return Shape(
+        width=width,
+        heads=max(1, width // 64),
+        blocks=len(attention),
+        hidden=hidden,
+        gated=any(linear.out_features == 2 * hidden for linear in expansion),
+        linear_parameters=sum(casts.values()),
+        adapted_parameters=sum(linear.weight.numel() for linear in linears),
+        other_parameters=every - sum(casts.values()),
+        # Both families put the outputs of two blocks beside each other.
+        channels=2 * width,
+        special=part.spec.special_tokens,
+    )
+
+
+def _base(module: nn.Module) -> nn.Linear:
+    return getattr(module, "base_layer", module)  # type: ignore[return-value]
+
+
+def _trained(module: nn.Module) -> bool:
+    return any(parameter.requires_grad for parameter in module.parameters(recurse=False))
+
+
+def weights(shape: Shape, *, half: bool) -> int:
+    """All weights of the model, heads included."""
+    return shape.linear_parameters * (2 if half else WIDE) + shape.other_parameters * WIDE
+
+
+def trained(parameters: int) -> int:
+    """Trained parameters with their gradients and AdamW's two moments."""
+    return 4 * WIDE * parameters
+
+
+def saved_per_token(shape: Shape, precision: Precision, *, rank: int, dropout: bool, device: torch.device) -> int:
+    """Bytes that one adapted block keeps per token from the forward to the backward pass."""
+    e, d, h = narrow(precision), shape.width, shape.hidden
+    norm_inputs = 2 * WIDE * d
+    lora_inputs = e * (3 * d + h)
+    attention = 6 * e * d
+    feed_forward = 3 * e * h if shape.gated else e * h
+    statistics = WIDE * (4 + 5 * shape.heads)
+    total = norm_inputs + lora_inputs + attention + feed_forward + statistics + 4 * rank * e
+    if dropout:
+        # Masks are bytes in CUDA's fused dropout and numbers elsewhere.
+        total += (3 * d + h) * (1 if device.type == "cuda" else WIDE)
+    return total
+
+
+def half_copies(shape: Shape, precision: Precision, *, stored_half: bool) -> int:
+    """Half copies of the adapted weights, kept for the backward pass unless the weights are stored that way."""
+    return 0 if precision == "fp32" or stored_half else 2 * shape.adapted_parameters
+
+
+def passing(shape: Shape, precision: Precision, *, with_adapter: bool) -> int:
+    """Bytes per token that live while one block is computed and are gone afterwards, at the widest place."""
+    e, d, h = narrow(precision), shape.width, shape.hidden
+    inner = 4 * h if shape.gated else 2 * h
+    low_rank = WIDE * (2 * h if shape.gated else h) if with_adapter and precision != "fp32" else 0
+    return 3 * WIDE * d + e * (d + inner) + low_rank
+
+
+def features(shape: Shape, tokens: int, layers: int) -> int:
+    """Feature tensors of some layers while `aggregate` makes them: the joined halves, and the normalised copy."""
+    return 2 * WIDE * layers * tokens * shape.channels
+
+
+def student(
+    shape: Shape, precision: Precision, *, tokens: int, layers: int, rank: int, dropout: bool, recompute: bool,
+    stored_half: bool, device: torch.device,
+) -> int:  # fmt: skip
+    """Peak of the student's forward and backward pass over a micro-batch of `tokens` tokens, without the losses."""
+    saved = saved_per_token(shape, precision, rank=rank, dropout=dropout, device=device)
+    if recompute:
+        kept = tokens * (shape.blocks * WIDE * shape.width + saved)
+    else:
+        kept = tokens * shape.blocks * saved + half_copies(shape, precision, stored_half=stored_half)
+    return kept + tokens * passing(shape, precision, with_adapter=True) + features(shape, tokens, layers)
+
+
+def teacher(shape: Shape, precision: Precision, *, tokens: int, layers: int, stored_half: bool) -> int:
+    """Peak of the teacher's pass over one view set, its features included."""
+    copies = half_copies(shape, precision, stored_half=stored_half)
+    return tokens * passing(shape, precision, with_adapter=False) + features(shape, tokens, layers) + copies
+
+
+def losses(shape: Shape, *, tokens: int, layers: int, triplets: int, batch: int) -> int:
+    """Gradients of all features, four blocks of the intra sweep, and the arrays over triplets."""
+    level = WIDE * tokens * shape.channels
+    return level * layers + 4 * min(level, WIDE << 25) + 16 * WIDE * triplets * batch
+
+
+def token_bytes(shape: Shape, tokens: int) -> int:
+    """One or several views' embedded tokens."""
+    return WIDE * tokens * shape.width
+
+
+def target_bytes(shape: Shape, *, kept_tokens: int, layers: int, anchors: int) -> int:
+    """Teacher targets of one view set: kept views at the loss layers, and anchors (tokens in all)."""
+    return WIDE * shape.channels * (kept_tokens * layers + anchors)
+
+
+def available(device: torch.device) -> int:
+    """Bytes that a run may use on a device, with some room left for what no plan sees."""
+    if device.type == "cuda":
+        return int(torch.cuda.mem_get_info(device)[0] * 0.92)
+    return int(host_available() * 0.8)
+
+
+def host_available() -> int:
+    """Bytes of main memory that are free or can be freed."""
+    import os
+    from pathlib import Path
+
+    lines = Path("/proc/meminfo").read_text().splitlines() if Path("/proc/meminfo").is_file() else []
+    for line in lines:
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return 8 << 30
+
+
+def describe(parts: Sequence[tuple[str, int]]) -> str:
+    """Return "12.3 GB: weights 2.3, ..." for parts in bytes."""
+    total = sum(size for _, size in parts)
+    listed = ", ".join(f"{name} {size / 1e9:.2f}" for name, size in parts if size)
+    return f"{total / 1e9:.2f} GB ({listed})"

@@ -1,0 +1,80 @@
+"""Options about the files that a command writes and the points that go into them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from freegeo.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from freegeo.fusion.filtering import FilterSettings
+    from freegeo.types import PhotoLike
+
+Format = Literal["ply", "glb", "mesh", "colmap", "nerfstudio", "depth", "npz"]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class FilterOptions:
+    """Which points are kept."""
+
+    drop_share: float = 0.4
+    """Least confident share of the pixels to drop, from 0 to below 1."""
+    flying: bool = True
+    """Drop pixels that hang between surfaces."""
+    multi_view: bool = True
+    """Drop pixels that more views contradict than confirm."""
+    min_agreeing: int = 0
+    """Other views that must agree with a pixel; more than 0 makes sparse, sure clouds."""
+    masks: Path | None = None
+    """Folder with one mask image per photo (same name, any image type; white is wanted)."""
+
+    def settings(self) -> FilterSettings:
+        """Return the filter settings."""
+        from freegeo.fusion.filtering import FilterSettings
+
+        return FilterSettings(
+            drop_share=self.drop_share, flying=self.flying, multi_view=self.multi_view, min_agreeing=self.min_agreeing
+        )
+
+    def load_masks(self, names: Sequence[str]) -> list[np.ndarray] | None:
+        """Read the masks of photos, by name."""
+        if self.masks is None:
+            return None
+        from freegeo.data.photos import load_masks
+
+        return load_masks(self.masks, names)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class FileOptions:
+    """Which files are written besides the predictions."""
+
+    formats: Annotated[tuple[Format, ...], Parameter(consume_multiple=True)] = ("ply", "glb")
+    """Any of ply, glb, mesh, colmap, nerfstudio, depth, npz."""
+    filters: FilterOptions = FilterOptions()
+
+    def settings(self) -> dict[str, object]:
+        """Return what the files depend on, for comparison with an existing folder."""
+        values = asdict(self.filters)
+        masks = values.pop("masks")
+        return {"formats": list(self.formats), "filters": values, "masks": None if masks is None else str(masks)}
+
+    def checked_masks(self, photos: Sequence[PhotoLike]) -> list[np.ndarray] | None:
+        """Read the masks and refuse other sizes than the photos', before anything is computed."""
+        masks = self.filters.load_masks([photo.name for photo in photos])
+        for photo, mask in zip(photos, masks or (), strict=bool(masks)):
+            if mask.shape != photo.size_hw:
+                raise UserError(
+                    f"the mask of {photo.name} is {mask.shape[1]} x {mask.shape[0]} pixels, the photo "
+                    f"{photo.size_hw[1]} x {photo.size_hw[0]}. Save masks at the size of the photos."
+                )
+        return masks

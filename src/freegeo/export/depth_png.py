@@ -1,0 +1,46 @@
+"""``depth/``: one 16-bit PNG per photo at the model's resolution, and ``depth.json`` with the scale.
+
+`depth_z = value * scale`; 0 means no depth. One scale serves all views: the largest depth has the value 65535.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from freegeo import storage
+from freegeo.export.reconstruction import Reconstruction
+
+FOLDER = "depth"
+LARGEST = 65535
+
+
+def write_depth(reconstruction: Reconstruction, folder: Path, *, keep: np.ndarray | None = None) -> list[Path]:
+    """Write the maps and the JSON file, and return their paths; pixels outside `keep` (S, H, W) get 0."""
+    from PIL import Image, PngImagePlugin
+
+    depth = reconstruction.depth_z
+    valid = np.isfinite(depth) & (depth > 0)
+    if keep is not None:
+        valid &= keep
+    scale = float(depth[valid].max()) / LARGEST if valid.any() else 1.0
+    # A valid depth never becomes the 0 that means none.
+    values = np.where(valid, np.clip(np.rint(np.where(valid, depth, 0) / scale), 1, LARGEST), 0).astype(np.uint16)
+    text = PngImagePlugin.PngInfo()
+    text.add_text("depth_scale", repr(scale))
+    paths = []
+    for name, view in zip(depth_names(reconstruction.names), values, strict=True):
+        with storage.atomic_path(folder / name) as part:
+            Image.fromarray(view).save(part, pnginfo=text, compress_level=1)
+        paths.append(folder / name)
+    maps = dict(zip(reconstruction.names, depth_names(reconstruction.names), strict=True))
+    meaning = "depth along the optical axis = value * scale; 0: no depth"
+    storage.write_json(folder / "depth.json", {"scale": scale, "meaning": meaning, "maps": maps})
+    return [*paths, folder / "depth.json"]
+
+
+def depth_names(names: tuple[str, ...]) -> list[str]:
+    """File names of the maps: the photos' with the suffix .png, added to the old one where photos differ in it only."""
+    short = [str(PurePosixPath(name).with_suffix(".png")) for name in names]
+    return short if len(set(short)) == len(names) else [f"{name}.png" for name in names]

@@ -1,0 +1,108 @@
+"""``scene.glb``: coloured points and one small frustum per camera, in glTF axes (y up, cameras look along -z)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from freegeo import storage
+from freegeo.export.ply import require_points
+from freegeo.fusion.points import PointCloud
+
+FILE_NAME = "scene.glb"
+FRUSTUM_SHARE = 0.08
+"""Depth of a frustum as a share of the median distance of the points from the cameras that saw them."""
+BEAM_SHARE = 0.02
+"""Width of a frustum's beams as a share of its depth."""
+# Corners: the camera's centre, then the image's; edges by corner numbers.
+_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
+_BOX_FACES = (
+    *((0, 2, 1), (0, 3, 2), (4, 5, 6), (4, 6, 7), (0, 1, 5), (0, 5, 4)),
+    *((1, 2, 6), (1, 6, 5), (2, 3, 7), (2, 7, 6), (3, 0, 4), (3, 4, 7)),
+)
+
+
+def opencv_to_gltf(vectors: np.ndarray) -> np.ndarray:
+    """Turn vectors (..., 3) from OpenCV axes (y down, z forward) to glTF axes (y up, z backward), half a turn about x.
+
+    The one place where the GLB's axes are decided; it is its own inverse.
+    """
+    return vectors * np.asarray((1, -1, -1), dtype=vectors.dtype)
+
+
+def write_glb(cloud: PointCloud, T_cam_world: np.ndarray, K: np.ndarray, image_hw: tuple[int, int], path: Path) -> Path:
+    """Write points and camera frusta.
+
+    The scene's objects are named `points` and `camera_000`, `camera_001`, ... in view order.
+
+    Args:
+        cloud: world points.
+        T_cam_world: (S, 4, 4).
+        K: (S, 3, 3) pixels of images of the size `image_hw`.
+        image_hw: height and width.
+        path: of the file.
+
+    Raises:
+        FreeGeoError: there is no point.
+    """
+    import trimesh
+
+    require_points(cloud, path)
+    scene = trimesh.Scene()
+    points = trimesh.PointCloud(opencv_to_gltf(cloud.points), colors=cloud.colours)
+    scene.add_geometry(points, geom_name="points", node_name="points")
+    size = FRUSTUM_SHARE * _typical_depth(cloud, T_cam_world)
+    for view, colour in enumerate(order_colours(len(K))):
+        corners = frustum_corners(T_cam_world[view], K[view], image_hw, size)
+        vertices, faces = _beams(corners, BEAM_SHARE * size)
+        colours = np.tile(colour, (len(vertices), 1))
+        mesh = trimesh.Trimesh(opencv_to_gltf(vertices), faces, vertex_colors=colours, process=False)
+        scene.add_geometry(mesh, geom_name=f"camera_{view:03d}", node_name=f"camera_{view:03d}")
+    with storage.atomic_path(path) as part:
+        part.write_bytes(scene.export(file_type="glb"))
+    return path
+
+
+def frustum_corners(T_cam_world: np.ndarray, K: np.ndarray, image_hw: tuple[int, int], depth: float) -> np.ndarray:
+    """World coordinates (5, 3) float64 of a camera's centre and its image's corners (clockwise from top left).
+
+    The corners are those of the outermost pixels' areas, pushed out to z-depth `depth`.
+    """
+    height, width = image_hw
+    left, top, right, bottom = -0.5, -0.5, width - 0.5, height - 0.5
+    pixels = np.array([(left, top, 1), (right, top, 1), (right, bottom, 1), (left, bottom, 1)])
+    corners = depth * pixels @ np.linalg.inv(K.astype(np.float64)).T
+    R, t = T_cam_world[:3, :3].astype(np.float64), T_cam_world[:3, 3].astype(np.float64)
+    return (np.concatenate((np.zeros((1, 3)), corners)) - t) @ R
+
+
+def order_colours(count: int) -> np.ndarray:
+    """Colours (count, 3) uint8 from blue (first view) over green and yellow to red (last view)."""
+    import colorsys
+
+    hues = np.linspace(2 / 3, 0.0, count) if count > 1 else np.array([2 / 3])
+    colours = [colorsys.hsv_to_rgb(hue, 0.85, 0.95) for hue in hues]
+    return (np.array(colours).reshape(-1, 3) * 255).round().astype(np.uint8)
+
+
+def _typical_depth(cloud: PointCloud, T_cam_world: np.ndarray) -> float:
+    chosen = cloud.select(np.linspace(0, len(cloud) - 1, min(len(cloud), 10_000)).astype(np.int64))
+    T = T_cam_world[chosen.view]
+    return float(np.median(np.einsum("ni,ni->n", T[:, 2, :3], chosen.points) + T[:, 2, 3]))
+
+
+def _beams(corners: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Square beams along the edges of a frustum: vertices (64, 3) and faces (96, 3)."""
+    vertices, faces = [], []
+    for start, end in _EDGES:
+        along = corners[end] - corners[start]
+        along /= np.linalg.norm(along)
+        helper = np.eye(3)[np.abs(along).argmin()]
+        side = np.cross(along, helper)
+        side *= 0.5 * width / np.linalg.norm(side)
+        up = np.cross(along, side)
+        ring = np.stack((-side - up, side - up, side + up, -side + up))
+        faces.append(np.array(_BOX_FACES) + 8 * len(faces))
+        vertices.append(np.concatenate((corners[start] + ring, corners[end] + ring)))
+    return np.concatenate(vertices), np.concatenate(faces)

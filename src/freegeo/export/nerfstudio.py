@@ -1,0 +1,55 @@
+"""``transforms.json`` for nerfstudio: OpenGL camera axes, intrinsics of the original photos, points as a start.
+
+World coordinates stay those of the reconstruction (and of `points.ply`, which the file names), only the cameras' axes
+turn: x right, y up, z backward. Pixel centres are at 0.5.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from freegeo import storage
+from freegeo.export.pixels import corner_K
+from freegeo.export.reconstruction import Reconstruction
+
+FILE_NAME = "transforms.json"
+
+
+def opengl_camera_to_world(T_cam_world: np.ndarray) -> np.ndarray:
+    """Camera-to-world matrices (S, 4, 4) float64 with OpenGL camera axes; the one place of this format's axes."""
+    T = T_cam_world.astype(np.float64)
+    return np.linalg.inv(T) @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def write_nerfstudio(
+    reconstruction: Reconstruction, path: Path, *, photo_folder: str = "images", points: str | None = None
+) -> Path:
+    """Write the cameras.
+
+    Args:
+        reconstruction: with cameras.
+        path: of the JSON file.
+        photo_folder: folder of the original photos, relative to the file; it is named, not created.
+        points: name of a point cloud beside the file.
+    """
+    K = corner_K(reconstruction)
+    matrices = opengl_camera_to_world(reconstruction.cameras()[0])
+    frames = [
+        {
+            "file_path": f"{photo_folder}/{name}",
+            "w": int(reconstruction.photo_hw[view, 1]),
+            "h": int(reconstruction.photo_hw[view, 0]),
+            "fl_x": K[view, 0, 0],
+            "fl_y": K[view, 1, 1],
+            "cx": K[view, 0, 2],
+            "cy": K[view, 1, 2],
+            "transform_matrix": matrices[view].tolist(),
+        }
+        for view, name in enumerate(reconstruction.names)
+    ]
+    distortion = {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+    cloud = {"ply_file_path": points} if points else {}
+    storage.write_json(path, {"camera_model": "OPENCV", **distortion, **cloud, "frames": frames})
+    return path

@@ -1,0 +1,63 @@
+"""From the model's pixels to those of the original photos, counted as other tools count them.
+
+freegeo gives the centre of the top left pixel the coordinates (0, 0). COLMAP and nerfstudio count from the image's
+corner, so that the same centre is at (0.5, 0.5). Resizing keeps corners, not centres, in place: a place in the model's
+image is `(u + 0.5 - offset) / scale` in the photo, counted from the corner. These functions are the only ones
+that know it; they keep every 3D point on the image content it was lifted from.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from freegeo.errors import UserError
+from freegeo.export.reconstruction import Reconstruction
+
+HALF = 0.5
+
+
+def corner_pixels(reconstruction: Reconstruction, view: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+    """Places (n, 2) in the photos, counted from the corner, of model pixels (n, 2) in the views `view` (n,)."""
+    return (pixel + HALF - reconstruction.offset_xy[view]) / reconstruction.scale_xy[view]
+
+
+def corner_K(reconstruction: Reconstruction) -> np.ndarray:
+    """Intrinsics (S, 3, 3) float64 of the original photos, with pixel centres at 0.5."""
+    K = reconstruction.cameras()[1].astype(np.float64)
+    K[:, :2, 2] += HALF - reconstruction.offset_xy
+    K[:, :2] /= reconstruction.scale_xy[:, :, None]
+    return K
+
+
+def masks_for_model(reconstruction: Reconstruction, masks: list[np.ndarray]) -> np.ndarray:
+    """Turn a user's masks into one (S, H, W) bool for the model's maps, true where points are wanted.
+
+    Args:
+        reconstruction: what the masks belong to.
+        masks: one array per view, of the photo's or of the model's height and width; anything but 0 is wanted.
+
+    Raises:
+        UserError: another number of masks than views, or a mask of another size.
+    """
+    if len(masks) != len(reconstruction):
+        raise UserError(f"{len(masks)} masks for {len(reconstruction)} views. Give one mask per photo, in their order.")
+    return np.stack([_model_mask(reconstruction, view, np.asarray(mask)) for view, mask in enumerate(masks)])
+
+
+def _model_mask(reconstruction: Reconstruction, view: int, mask: np.ndarray) -> np.ndarray:
+    height, width = reconstruction.image_hw
+    photo_hw = tuple(reconstruction.photo_hw[view].tolist())
+    if mask.shape == (height, width):
+        return mask != 0
+    if mask.shape != photo_hw:
+        size = " x ".join(str(side) for side in mask.shape)
+        raise UserError(
+            f"The mask of {reconstruction.names[view]} has the size {size}, but the photo is "
+            f"{photo_hw[0]} x {photo_hw[1]} (height x width). Save masks at the size of the photos."
+        )
+    scale, offset = reconstruction.scale_xy[view], reconstruction.offset_xy[view]
+    column, row = (
+        np.clip(((np.arange(side) + HALF - offset[axis]) / scale[axis]).astype(np.int64), 0, photo_hw[1 - axis] - 1)
+        for axis, side in enumerate((width, height))
+    )
+    return mask[row[:, None], column] != 0

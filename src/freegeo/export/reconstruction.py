@@ -1,0 +1,209 @@
+"""One prediction of one scene as NumPy arrays, and its file ``prediction.npz``: what every export starts from.
+
+The keys are field names and stay as they are, because scripts of users read them:
+
+| key | shape | type | meaning |
+|---|---|---|---|
+| `depth_z` | (S, H, W) | float32 | coordinate along the optical axis, up to scale unless the model is metric |
+| `conf` | (S, H, W) | float32 | confidence, higher is better, not calibrated; 1 where the model gives none |
+| `T_cam_world` | (S, 4, 4) | float32 | world to camera, OpenCV axes; absent without cameras |
+| `K` | (S, 3, 3) | float32 | pixels of the H x W map, centres at whole numbers; absent without cameras |
+| `sky` | (S, H, W) | float32 | probability of sky; absent when the model does not give it |
+| `images` | (S, H, W, 3) | uint8 | the images the model read |
+| `names` | (S,) | str | names of the photos |
+| `photo_hw` | (S, 2) | int64 | height and width of the photos after EXIF rotation |
+| `scale_xy`, `offset_xy` | (S, 2) | float64 | model pixel = photo pixel * scale + offset, x first |
+| `format` | () | int64 | version of this table |
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from freegeo import storage
+from freegeo.errors import FreeGeoError, UserError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from freegeo.types import ImageBatch, Prediction
+
+FILE_NAME = "prediction.npz"
+FORMAT = 1
+_OPTIONAL = ("T_cam_world", "K", "sky")
+_DTYPES = {"images": np.uint8, "photo_hw": np.int64, "scale_xy": np.float64, "offset_xy": np.float64}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruction:
+    """A prediction for S photos at the model's resolution H x W; the table above is the description of its fields."""
+
+    depth_z: np.ndarray
+    """(S, H, W) float32."""
+    conf: np.ndarray
+    """(S, H, W) float32."""
+    images: np.ndarray
+    """(S, H, W, 3) uint8 RGB."""
+    names: tuple[str, ...]
+    photo_hw: np.ndarray
+    """(S, 2) int64."""
+    scale_xy: np.ndarray
+    """(S, 2) float64."""
+    offset_xy: np.ndarray
+    """(S, 2) float64."""
+    T_cam_world: np.ndarray | None = None
+    """(S, 4, 4) float32."""
+    K: np.ndarray | None = None
+    """(S, 3, 3) float32."""
+    sky: np.ndarray | None = None
+    """(S, H, W) float32."""
+
+    def __post_init__(self) -> None:
+        """Raise FreeGeoError when a shape does not fit the others."""
+        views, height, width = self.depth_z.shape
+        expected = {
+            "conf": (views, height, width),
+            "images": (views, height, width, 3),
+            "photo_hw": (views, 2),
+            "scale_xy": (views, 2),
+            "offset_xy": (views, 2),
+            "T_cam_world": (views, 4, 4),
+            "K": (views, 3, 3),
+            "sky": (views, height, width),
+        }
+        for name, shape in expected.items():
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise FreeGeoError(f"{name} of a reconstruction has the shape {value.shape}, expected {shape}.")
+        if len(self.names) != views:
+            raise FreeGeoError(f"A reconstruction of {views} views has {len(self.names)} names.")
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return len(self.names)
+
+    @property
+    def image_hw(self) -> tuple[int, int]:
+        """Height and width of the model's maps."""
+        return self.depth_z.shape[1], self.depth_z.shape[2]
+
+    @property
+    def has_cameras(self) -> bool:
+        """Whether the model predicted cameras."""
+        return self.K is not None and self.T_cam_world is not None
+
+    def cameras(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return `T_cam_world` (S, 4, 4) and `K` (S, 3, 3); UserError when the model predicts no cameras."""
+        if self.T_cam_world is None or self.K is None:
+            raise UserError(
+                "This reconstruction has no cameras, so it has no 3D points. Use a model that predicts cameras."
+            )
+        return self.T_cam_world, self.K
+
+    def photo_K(self) -> np.ndarray:
+        """Intrinsics (S, 3, 3) float64 of the original photos, pixel centres at whole numbers.
+
+        The inverse of the rule the models' intrinsics follow: `u_photo = (u_model - offset) / scale`.
+        """
+        K = self.cameras()[1].astype(np.float64)
+        K[:, :2, 2] -= self.offset_xy
+        K[:, :2] /= self.scale_xy[:, :, None]
+        return K
+
+    @classmethod
+    def from_prediction(cls, prediction: Prediction, batch: ImageBatch) -> Reconstruction:
+        """Take over a model's answer for a batch of photos.
+
+        Args:
+            prediction: tensors (S, ...) or (1, S, ...), on any device.
+            batch: what the model read, in the same order.
+
+        Raises:
+            FreeGeoError: without depth, or for several scenes at once.
+        """
+        if prediction.depth_z is None:
+            raise FreeGeoError("A prediction without depth cannot be stored. Decode with want=('depth', 'cameras').")
+        depth_z = _to_numpy(prediction.depth_z, trailing=3)
+        assert depth_z is not None
+        conf = _to_numpy(prediction.conf, trailing=3)
+        images = (batch.images.detach().float().clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1)
+        return cls(
+            depth_z=depth_z,
+            conf=np.ones_like(depth_z) if conf is None else conf,
+            T_cam_world=_to_numpy(prediction.T_cam_world, trailing=3),
+            K=_to_numpy(prediction.K, trailing=3),
+            sky=_to_numpy(prediction.sky, trailing=3),
+            images=np.ascontiguousarray(images.cpu().numpy()),
+            names=tuple(batch.names),
+            photo_hw=batch.photo_hw.cpu().numpy().astype(np.int64),
+            scale_xy=batch.scale_xy.cpu().numpy().astype(np.float64),
+            offset_xy=batch.offset_xy.cpu().numpy().astype(np.float64),
+        )
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the content of the file: every field that is there, under its name, and the format."""
+        present = {f.name: getattr(self, f.name) for f in fields(self)}
+        arrays = {name: np.asarray(value) for name, value in present.items() if value is not None}
+        return {**arrays, "format": np.array(FORMAT, np.int64)}
+
+    def save(self, path: Path | str) -> Path:
+        """Write the file (`prediction.npz` of `path` when that is a folder) atomically; returns where it is."""
+        file = _file(path)
+        storage.write_npz(file, self.arrays())
+        return file
+
+    @classmethod
+    def load(cls, path: Path | str) -> Reconstruction:
+        """Read what `save` wrote, from the file or the folder it is in.
+
+        Raises:
+            UserError: there is no such file, or a newer freegeo wrote it.
+            FreeGeoError: the file is damaged or something else.
+        """
+        file = _file(path)
+        if not file.is_file():
+            raise UserError(
+                f"{path}: holds no reconstruction ({FILE_NAME} is missing). Run `freegeo reconstruct` first."
+            )
+        try:
+            with np.load(file, allow_pickle=False) as content:
+                arrays = {name: content[name] for name in content.files}
+        except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError) as error:
+            raise FreeGeoError(f"{file}: damaged file ({error}). Remove it and run again.") from None
+        return cls._from_arrays(arrays, file)
+
+    @classmethod
+    def _from_arrays(cls, arrays: dict[str, np.ndarray], file: Path) -> Reconstruction:
+        version = int(arrays.get("format", FORMAT))
+        if version > FORMAT:
+            raise UserError(f"{file}: written by a newer freegeo (format {version}). Update freegeo.")
+        names = [f.name for f in fields(cls)]
+        missing = [name for name in names if name not in arrays and name not in _OPTIONAL]
+        if missing:
+            raise FreeGeoError(f"{file}: not a reconstruction, {', '.join(missing)} missing. Name another file.")
+        values = {n: arrays[n].astype(_DTYPES.get(n, np.float32)) for n in names if n in arrays and n != "names"}
+        try:
+            return cls(**values, names=tuple(str(name) for name in arrays["names"]))
+        except (FreeGeoError, ValueError) as error:
+            raise FreeGeoError(f"{file}: not a reconstruction ({error}) Name another file.") from None
+
+
+def _file(path: Path | str) -> Path:
+    path = Path(path)
+    return path if path.suffix == ".npz" else path / FILE_NAME
+
+
+def _to_numpy(tensor: Tensor | None, *, trailing: int) -> np.ndarray | None:
+    if tensor is None:
+        return None
+    if tensor.ndim == trailing + 1 and tensor.shape[0] == 1:
+        tensor = tensor[0]
+    if tensor.ndim != trailing:
+        raise FreeGeoError(f"One reconstruction holds one scene, got a prediction of shape {tuple(tensor.shape)}.")
+    return np.ascontiguousarray(tensor.detach().float().cpu().numpy())

@@ -1,0 +1,126 @@
+"""View draws and augmentation are those of the release, seed by seed; small scenes do what the recipe says."""
+
+import pytest
+import torch
+
+from freegeo.adaptation import recipe as recipes
+from freegeo.adaptation.images import released_augmentation
+from freegeo.adaptation.views import draw_frames, kept_positions, schedule, view_sets
+from freegeo.errors import UserError
+from tiny_models import quick, tiny_da3
+
+MODEL = tiny_da3()
+
+# Frames -> drawn views for seeds 40, 41, 42 and 1000040: fact sheet, section 3.3.
+SEEDS = (40, 41, 42, 1_000_040)
+DRAWS = {
+    3: ("0 0 0 1 1 2 2 2", "0 0 0 1 1 1 1 2", "0 0 0 1 1 2 2 2", "0 0 1 1 2 2 2 2"),
+    5: ("0 1 2 3 3 4 4 4", "0 1 1 2 2 3 3 4", "0 0 0 1 2 2 3 4", "0 0 1 2 2 3 4 4"),
+    8: ("0 1 2 3 4 5 6 7",) * 4,
+    11: ("0 1 2 4 6 7 8 9", "2 3 4 5 6 7 8 9", "0 1 4 5 6 8 9 10", "0 1 3 4 5 7 8 9"),
+    38: ("2 8 13 15 18 24 29 33", "10 12 14 17 18 21 24 37", "1 6 7 8 14 15 17 21", "2 7 8 12 22 23 26 30"),
+    1000: (
+        "32 251 289 469 536 593 680 898", "170 236 340 390 394 591 923 935",
+        "25 114 142 228 250 281 654 759", "36 377 596 670 869 908 910 990",
+    ),
+}  # fmt: skip
+# Seed -> mirrored, brightness factor of each view: same section.
+AUGMENTATION = {
+    40: (True, "- .913 - - .939 - .811 -"),
+    41: (True, ".866 - - - - 1.093 - -"),
+    42: (False, ".910 1.095 - - .969 .887 - .880"),
+    43: (True, "- .985 - - .999 .973 1.141 -"),
+    44: (True, "- - .890 .847 .863 - - -"),
+    45: (True, ".833 .829 .914 .924 - 1.050 1.118 -"),
+    46: (False, "1.035 - 1.006 - - .828 1.130 -"),
+    47: (True, ".981 1.005 .816 .809 .906 - 1.019 -"),
+    48: (False, "1.085 1.175 1.105 1.186 - 1.060 1.005 -"),
+    49: (True, ".844 - - .818 - 1.093 - -"),
+}
+
+
+@pytest.mark.parametrize("frames", DRAWS)
+def test_view_draws_are_the_published_ones(frames):
+    for seed, wanted in zip(SEEDS, DRAWS[frames], strict=True):
+        assert draw_frames(frames, 8, seed, repeat=True) == tuple(int(n) for n in wanted.split())
+
+
+@pytest.mark.parametrize("seed", AUGMENTATION)
+def test_augmentation_is_the_published_one(seed):
+    mirrored, factors = AUGMENTATION[seed]
+    images = torch.linspace(0.3, 0.6, 5).expand(8, 3, 2, 5)
+    changed = released_augmentation(images, seed)
+    ratio = (changed.flip(-1) if mirrored else changed) / images
+    wanted = torch.tensor([1.0 if f == "-" else float(f) for f in factors.split()])
+    torch.testing.assert_close(ratio.mean((1, 2, 3)), wanted, atol=5.1e-4, rtol=0)
+    assert (ratio.amax((1, 2, 3)) - ratio.amin((1, 2, 3)) < 1e-5).all()
+
+
+def test_augmented_images_stay_in_range():
+    assert released_augmentation(torch.ones(8, 3, 2, 2), 48).amax() == 1
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 6, 7, 8])
+def test_a_small_scene_is_used_whole_and_every_second_view_is_kept(count):
+    for one in view_sets([count], quick(MODEL)):
+        assert one.frames == tuple(range(count))
+        assert one.kept == tuple(range(0, count, 2))
+        assert 2 <= len(one.kept) < count
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_fewer_than_three_photos_are_refused(count):
+    with pytest.raises(UserError, match=f"at least 3 photos, got {count}"):
+        view_sets([5, count], quick(MODEL))
+
+
+def test_any_number_of_views_and_any_kept_ones():
+    recipe = quick(MODEL, views=16, keep=(0, 4, 8, 12))
+    [one, *_] = view_sets([30], recipe)
+    assert len(set(one.frames)) == 16
+    assert list(one.frames) == sorted(one.frames)
+    assert one.kept == (0, 4, 8, 12)
+    assert view_sets([30], quick(MODEL, views=16))[0].kept == tuple(range(0, 16, 2))
+
+
+def test_a_choice_of_kept_views_that_a_small_scene_cannot_have_falls_back():
+    assert kept_positions(8, (0, 3)) == (0, 3)
+    assert kept_positions(3, (0, 4)) == (0, 2)
+    assert kept_positions(3, (0, 1, 2)) == (0, 2), "all views kept would leave none to learn from"
+
+
+def test_sets_count_their_seeds_on_and_wrap_around():
+    recipe = recipes.named("released-vggt", MODEL.spec, "eth3d")
+    seeds = [one.seed for one in view_sets([20, 20], recipe)]
+    assert seeds == [40, 41, 42, 43, 44] * 4
+    assert [one.seed for one in view_sets([20, 20], recipe, epoch=2)] == [s + 2_000_000 for s in seeds]
+
+
+def test_sets_stay_the_same_over_the_epochs_unless_redrawn():
+    recipe = quick(MODEL, epochs=2)
+    assert view_sets([20], recipe, epoch=1) == view_sets([20], recipe, epoch=0)
+
+
+def test_every_set_is_visited_once_per_epoch_in_an_order_of_the_seed():
+    recipe = quick(MODEL, epochs=2, batch=2)
+    steps = schedule([9, 12], recipe, seed=1)
+    sets = view_sets([9, 12], recipe)
+    for epoch in (0, 1):
+        visited = [visit.view_set for step in steps for visit in step if visit.epoch == epoch]
+        assert sorted(visited, key=sets.index) == sets
+    assert [visit.step for step in steps for visit in step] == [i for i, step in enumerate(steps) for _ in step]
+    assert schedule([9, 12], recipe, seed=1) == steps
+    assert schedule([9, 12], recipe, seed=2) != steps
+
+
+def test_the_last_incomplete_batch_is_kept_or_dropped_as_the_recipe_says():
+    kept = quick(MODEL, epochs=1, batch=2)
+    assert [len(step) for step in schedule([9], kept, seed=0)] == [2, 1]
+    dropping = recipes.named("released-da3", MODEL.spec, "eth3d")
+    assert [len(step) for step in schedule([9], dropping, seed=0)] == [4, 4, 4]
+
+
+def test_a_number_of_steps_goes_through_as_many_epochs_as_it_takes():
+    steps = schedule([9], quick(MODEL, steps=7), seed=0)
+    assert len(steps) == 7
+    assert [step[0].epoch for step in steps] == [0, 0, 0, 1, 1, 1, 2]

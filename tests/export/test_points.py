@@ -1,0 +1,142 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from exact_rooms import cloud_of, room
+from freegeo.errors import FreeGeoError, UserError
+from freegeo.export.glb import FRUSTUM_SHARE, frustum_corners, opencv_to_gltf, order_colours, write_glb
+from freegeo.export.ply import write_ply
+from freegeo.fusion.points import PointCloud
+
+
+def write_scene(scene, cloud, path):
+    return write_glb(cloud, scene.T_cam_world, scene.K, scene.image_hw, path)
+
+
+def test_points_project_back_to_their_pixels_and_carry_their_colours():
+    scene = room()
+    cloud = cloud_of(scene, drop_share=0.0, drop_flying=False)
+    assert len(cloud) == scene.depth_z.size
+    T, K = scene.T_cam_world[cloud.view], scene.K[cloud.view]
+    camera = np.einsum("nij,nj->ni", T[:, :3, :3], cloud.points) + T[:, :3, 3]
+    pixel = np.einsum("nij,nj->ni", K, camera)
+    np.testing.assert_allclose(pixel[:, :2] / pixel[:, 2:], cloud.pixel, atol=2e-3)
+    column, row = cloud.pixel.T
+    np.testing.assert_allclose(camera[:, 2], scene.depth_z[cloud.view, row, column], rtol=1e-4)
+    np.testing.assert_array_equal(cloud.colours, scene.images[cloud.view, row, column])
+
+
+def test_the_least_confident_share_is_left_out():
+    scene = room()
+    conf = np.random.default_rng(0).permutation(scene.conf.size).reshape(scene.conf.shape).astype(np.float32)
+    cloud = cloud_of(replace(scene, conf=conf), drop_share=0.4, drop_flying=False)
+    assert len(cloud) == pytest.approx(0.6 * conf.size, abs=2)
+    assert cloud.conf.min() >= 0.4 * conf.size - 2
+    assert len(cloud_of(scene, drop_share=0.4, drop_flying=False)) == conf.size, "a constant confidence ranks nothing"
+
+
+def test_invalid_depth_and_masked_pixels_give_no_point():
+    scene = room()
+    depth = scene.depth_z.copy()
+    depth[0, 0, :3] = (0.0, np.nan, np.inf)
+    keep = np.ones(depth.shape, bool)
+    keep[1] = False
+    cloud = cloud_of(replace(scene, depth_z=depth), drop_share=0.0, drop_flying=False, keep=keep)
+    assert len(cloud) == depth.size - 3 - depth[1].size
+    assert np.isfinite(cloud.points).all()
+    assert 1 not in cloud.view
+
+
+def test_thinning_is_seeded_and_keeps_the_order():
+    scene = room()
+    first, again, other = (cloud_of(scene, max_points=100, seed=seed) for seed in (1, 1, 2))
+    assert len(first) == 100
+    np.testing.assert_array_equal(first.points, again.points)
+    assert not np.array_equal(first.points, other.points)
+    assert (np.diff(first.view) >= 0).all()
+    with pytest.raises(UserError, match="at least 1"):
+        cloud_of(scene, max_points=0)
+    with pytest.raises(UserError, match="share"):
+        cloud_of(scene, drop_share=1.0)
+
+
+def test_ply_reopens_with_the_same_points_and_colours(tmp_path):
+    cloud = cloud_of(room())
+    loaded = trimesh.load(write_ply(cloud, tmp_path / "deep" / "points.ply"))
+    np.testing.assert_array_equal(loaded.vertices.astype(np.float32), cloud.points)
+    np.testing.assert_array_equal(loaded.colors[:, :3], cloud.colours)
+    assert [p.name for p in (tmp_path / "deep").iterdir()] == ["points.ply"]
+
+
+def test_gltf_axes():
+    np.testing.assert_array_equal(opencv_to_gltf(np.array([[1.0, 2.0, 3.0]])), [[1.0, -2.0, -3.0]])
+    np.testing.assert_array_equal(opencv_to_gltf(opencv_to_gltf(np.eye(3))), np.eye(3))
+
+
+def test_glb_reopens_with_the_same_points_colours_and_cameras(tmp_path):
+    scene = room()
+    cloud = cloud_of(scene)
+    loaded = trimesh.load(write_scene(scene, cloud, tmp_path / "scene.glb"))
+    assert set(loaded.geometry) == {"points", "camera_000", "camera_001", "camera_002", "camera_003"}
+    points = loaded.geometry["points"]
+    np.testing.assert_allclose(points.vertices, opencv_to_gltf(cloud.points), rtol=1e-6)
+    np.testing.assert_array_equal(points.colors[:, :3], cloud.colours)
+    for view, colour in enumerate(order_colours(4)):
+        camera = loaded.geometry[f"camera_{view:03d}"]
+        assert isinstance(camera, trimesh.Trimesh)
+        np.testing.assert_array_equal(np.unique(camera.visual.vertex_colors[:, :3], axis=0), [colour])
+
+
+def test_frusta_stand_where_the_cameras_are_and_look_where_they_look(tmp_path):
+    scene = room()
+    loaded = trimesh.load(write_scene(scene, cloud_of(scene), tmp_path / "scene.glb"))
+    for view in range(len(scene)):
+        T = scene.T_cam_world[view].astype(np.float64)
+        vertices = opencv_to_gltf(np.asarray(loaded.geometry[f"camera_{view:03d}"].vertices))
+        camera = vertices @ T[:3, :3].T + T[:3, 3]
+        depth = FRUSTUM_SHARE * np.median(scene.depth_z)
+        width = 0.03 * depth
+        assert -width < camera[:, 2].min() < width
+        assert camera[:, 2].max() == pytest.approx(depth, rel=0.2)
+        at_centre = np.linalg.norm(camera, axis=-1) < 2 * width
+        assert at_centre.sum() == 16, "four beams start at the centre, four corners each"
+
+
+def test_a_point_in_front_of_the_first_camera_is_at_minus_z_and_up_is_plus_y(tmp_path):
+    cloud = PointCloud(
+        points=np.array([[0, 0, 2], [0, -1, 2]], np.float32),
+        colours=np.array([[255, 0, 0], [0, 255, 0]], np.uint8),
+        conf=np.ones(2, np.float32),
+        view=np.zeros(2, np.int64),
+        pixel=np.zeros((2, 2), np.int64),
+    )
+    K = np.array([[[50, 0, 32], [0, 50, 24], [0, 0, 1]]], np.float32)
+    file = write_glb(cloud, np.eye(4, dtype=np.float32)[None], K, (48, 64), tmp_path / "a.glb")
+    loaded = trimesh.load(file)
+    np.testing.assert_array_equal(loaded.geometry["points"].vertices, [[0, 0, -2], [0, 1, -2]])
+    assert loaded.geometry["camera_000"].vertices[:, 2].min() < -0.1
+
+
+def test_frustum_corners_are_the_image_corners():
+    scene = room()
+    height, width = scene.image_hw
+    corners = frustum_corners(scene.T_cam_world[1], scene.K[1], (height, width), 0.5)
+    T = scene.T_cam_world[1]
+    camera = corners @ T[:3, :3].T + T[:3, 3]
+    np.testing.assert_allclose(camera[0], 0, atol=1e-5)
+    np.testing.assert_allclose(camera[1:, 2], 0.5, rtol=1e-5)
+    pixels = camera[1:] @ scene.K[1].T
+    expected = [(-0.5, -0.5), (width - 0.5, -0.5), (width - 0.5, height - 0.5), (-0.5, height - 0.5)]
+    np.testing.assert_allclose(pixels[:, :2] / pixels[:, 2:], expected, atol=1e-3)
+
+
+def test_nothing_is_written_without_points(tmp_path):
+    scene = room()
+    empty = cloud_of(scene).select(np.zeros(0, np.int64))
+    with pytest.raises(FreeGeoError, match="no point is left"):
+        write_ply(empty, tmp_path / "points.ply")
+    with pytest.raises(FreeGeoError, match="no point is left"):
+        write_scene(scene, empty, tmp_path / "scene.glb")
+    assert list(tmp_path.iterdir()) == []
