@@ -30,6 +30,8 @@ class Domain:
     """Half the width and half the depth of the room."""
     ambient: Range = (0.4, 0.62)
     """Share of the light that does not come from the lamp."""
+    exposure: float = 1.0
+    """Factor on all light: in a dim room a camera exposes longer, and black views would say nothing."""
     contrast: Range = (1.0, 1.0)
     """How far the second and third colour of a surface are from its first one: 0 makes the surface uniform."""
     saturation: float = 1.0
@@ -57,7 +59,7 @@ _TRAIN = Domain(name="train", first_seed=0, seed_count=10_000_000, room_count=10
 _TEST = Domain(name="test-id", first_seed=20_000_000, seed_count=10_000, room_count=200)
 _SHIFTED = (
     replace(_TEST, name="light", first_seed=20_100_000, room_count=100, bank="light", ambient=(0.12, 0.25),
-            colour_cast=0.35, gamma=(1.3, 1.8), grain=0.04),
+            exposure=1.6, colour_cast=0.35, gamma=(1.3, 1.8), grain=0.04),
     replace(_TEST, name="lowtex", first_seed=20_200_000, room_count=100, bank="lowtex", contrast=(0.15, 0.3)),
     replace(_TEST, name="tex", first_seed=20_300_000, room_count=100, bank="tex", saturation=0.5),
     replace(_TEST, name="big", first_seed=20_400_000, room_count=100, bank="big", half_extent_m=(3.6, 5.5)),

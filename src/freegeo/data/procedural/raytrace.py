@@ -5,11 +5,11 @@ are one flat dimension. Ray directions have unit z in the camera frame, so the r
 
 Pixels. Pixel u of a W pixels wide image covers [u, u + 1) of the image plane, whose middle W / 2 the optical axis
 meets; its ray goes through u + 0.5. That makes shrinking by area averaging exact. Written for integer pixel centres,
-the rule of `freegeo.geometry.camera`, the same camera has cx = W / 2 - 0.5 and cy = H / 2 - 0.5, and this K is what is returned:
-`depth_z` unprojected with it and integer pixel centres gives the exact surface points. Networks of the DA3 and VGGT
-family decode cx = W / 2 instead: half a pixel, or about 0.4 degrees of viewing direction at 96 pixels and 0.15 at 256.
-For the same reason scaling the rows of K by w' / w and h' / h, as those models do when they shrink a photo, is off by
-(1 - w' / w) / 2 pixels from the K rendered at the small size; `resized_intrinsics` is the exact rule.
+the rule of `freegeo.geometry.camera`, the same camera has cx = W / 2 - 0.5 and cy = H / 2 - 0.5, and this K is what
+is returned: `depth_z` unprojected with it and integer pixel centres gives the exact surface points. Networks of the DA3
+and VGGT family decode cx = W / 2 instead: half a pixel, or about 0.4 degrees of viewing direction at 96 pixels and 0.15
+at 256. For the same reason scaling the rows of K by w' / w and h' / h, as those models do when they shrink a photo, is
+off by (1 - w' / w) / 2 pixels from the K rendered at the small size; `resized_intrinsics` is the exact rule.
 """
 
 from __future__ import annotations
@@ -210,7 +210,8 @@ def _shade(
     footprint = depth * (2.0 * torch.tan(0.5 * rooms.fov_rad[scene])[:, None] / width)
     albedo = _albedo(local, scaled, axis, primitive, footprint, rooms, scene, bank)
     lamp_light = strength[:, None] * rooms.lamp_colour[scene][..., None]
-    return (albedo * (rooms.ambient[scene][:, None, None] + lamp_light)).clamp_(0.0, 1.0)
+    light = rooms.ambient[scene][:, None, None] + lamp_light
+    return (rooms.domain.exposure * albedo * light).clamp_(0.0, 1.0)
 
 
 def _turned(vector: list[Tensor], cosine: Tensor, sine: Tensor) -> list[Tensor]:
@@ -258,7 +259,7 @@ def _albedo(
     materials = rooms.texture.shape[1]
     material = torch.where(primitive == 0, 2 * axis + side, 5 + primitive) + scene[:, None] * materials
     # Faces of one object cut the texture at different places; the room's faces have materials of their own.
-    shift = along.detach().sign() * 0.31 + axis * 0.17
+    shift = along.sign() * 0.31 + axis * 0.17
     mix = []
     for layer in range(2):
         inverse = (1.0 / rooms.period_m[..., layer]).flatten()[material]
@@ -298,4 +299,5 @@ def _grain(rooms: RoomBatch, views: Tensor, hw: tuple[int, int]) -> Tensor:
     )
     cells_noise = torch.from_numpy(noise.astype(np.float32)).flatten(0, 1).to(rooms.device)
     grain = torch.nn.functional.interpolate(cells_noise, size=hw, mode="bilinear", align_corners=False)
-    return (grain / grain.std()).unflatten(0, (len(rooms), len(views)))
+    # Interpolation averages cells; each view is rescaled alone, so that it does not depend on its batch.
+    return (grain / grain.std(dim=(1, 2, 3), keepdim=True)).unflatten(0, (len(rooms), len(views)))

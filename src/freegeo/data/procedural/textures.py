@@ -6,6 +6,7 @@ rings of the domain `tex`). Every pattern carries some noise of its own, so that
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -133,7 +134,9 @@ def _stripes(rng: np.random.Generator) -> Array:
     position = across * column + along * row
     width = rng.uniform(0.35, 0.65)
     tint = 0.5 * rng.random(64)
-    stripe = (position % 1.0 < width) + tint[(np.floor(position) % across).astype(int)]
+    # One period down, a slanted stripe continues as the stripe `along` places away: those have to share their tint.
+    tints = math.gcd(int(across), int(along))
+    stripe = (position % 1.0 < width) + tint[(np.floor(position) % tints).astype(int)]
     return _soft(stripe.astype(float)) + 0.18 * _noise(rng)
 
 

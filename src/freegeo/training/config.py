@@ -1,0 +1,91 @@
+"""Every number of a training run, and how the run changes as views pass by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossWeights:
+    """Weights of the training objective (embedded-model spec, section 4)."""
+
+    depth: float = 1.0
+    gradient: float = 0.5
+    rotation: float = 3.0
+    translation: float = 1.0
+    absolute: float = 0.5
+    field_of_view: float = 2.0
+    rays: float = 2.0
+    points: float = 2.0
+    matching: float = 0.3
+    position: float = 2.0
+    ray_branch: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """What samples are like at one point of a run."""
+
+    views: tuple[int, ...]
+    """Possible numbers of views in a sample."""
+    max_stride: int
+    """Largest distance between neighbouring views, in frames."""
+    side: int
+    """Longest image side in pixels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Train the embedded model on generated rooms."""
+
+    views: int = 1_000_000
+    """Views the model learns from, counted with repetition; the last `cooldown` of them lower the learning rate."""
+    seed: int = 0
+    side: int = 64
+    """Longest image side in pixels."""
+    views_per_step: int = 32
+    rooms: int = 3_072
+    """Rooms in the pool; they are rendered a shard at a time while training goes on."""
+    frames: int = 10
+    matrix_lr: float = 4e-3
+    """Muon, for the matrices of the blocks and the camera decoder."""
+    other_lr: float = 1e-3
+    """AdamW, for the backbone's embeddings, norms and biases."""
+    head_lr: float = 3e-4
+    """AdamW, for the dense head and the last linear layers. Their inputs have a large mean, so that a step moves all
+    outputs of a layer together: at 2e-3 rectifiers died within a few hundred steps, and the answers were constant."""
+    warmup_views: int = 6_000
+    cooldown: float = 0.25
+    ema: float = 0.998
+    clip: float = 1.0
+    pairs_until: int = 25_000
+    """Views before windows reach beyond 2 or 3 neighbouring frames."""
+    short_until: int = 60_000
+    """Views before windows reach 8 views and stride 3."""
+    small_until: int = 90_000
+    """Views before the images reach their full size; at three quarters of it a view costs 40 % less."""
+    depth_views: int = 6
+    """Views that the dense head learns from in one step, one of each sample; it learns fastest and costs most."""
+    ray_branch_every: int = 8
+    """Steps between two updates of the ray branch, which learns on detached features."""
+    weights: LossWeights = LossWeights()
+
+    def stage(self, seen: int) -> Stage:
+        """Return what is learned from after `seen` views: short windows come first, and small images."""
+        side = self.side * 3 // 4 if seen < self.small_until else self.side
+        if seen < self.pairs_until:
+            return Stage(views=(2, 3), max_stride=1, side=side)
+        if seen < self.short_until:
+            return Stage(views=(2, 3, 4), max_stride=2, side=side)
+        return Stage(views=(2, 4, 4, 6, 8, 8), max_stride=3, side=side)
+
+    def rate(self, seen: int) -> float:
+        """Return the factor on both learning rates: warm-up, plateau, linear cool-down to zero."""
+        warm = min(1.0, seen / self.warmup_views)
+        start = self.cooldown_start
+        return warm if seen < start else max(0.0, (self.views - seen) / (self.views - start))
+
+    @property
+    def cooldown_start(self) -> float:
+        """Views after which the learning rate falls."""
+        return self.views * (1 - self.cooldown)

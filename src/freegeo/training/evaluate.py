@@ -1,0 +1,177 @@
+"""The checkpoint's report on generated rooms: 4 views, 8 views, and 8 views decoded for 4 ("8->4")."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from freegeo.benchmark.bootstrap import Interval, paired_interval
+from freegeo.benchmark.cloud import f1_rel5
+from freegeo.benchmark.depth import score_depth
+from freegeo.benchmark.pose import pair_errors, pose_auc
+from freegeo.data.procedural import get_domain
+from freegeo.geometry import se3
+from freegeo.geometry.camera import K_from_fov
+from freegeo.models.api import ReconstructionModel
+from freegeo.storage import write_json
+from freegeo.training.objective import given
+from freegeo.training.pool import Rooms, image_size, render_rooms
+from freegeo.types import Prediction
+
+ALL_VIEWS = 8
+KEPT = (0, 2, 4, 6)
+MODES = ("4", "8->4", "8")
+ROOMS_PER_BATCH = 8
+ASPECT = (3, 4)
+GAP_METRICS = ("auc30", "auc15", "auc05", "f1", "abs_rel", "rotation_deg", "translation_deg")
+PREMISE_METRICS = ("auc30", "auc15", "f1")
+"""Metrics whose 8->4 minus 4 interval has to leave out zero on the good side."""
+DOMAIN_ROOMS = {"test-id": 200, "light": 100, "lowtex": 100, "tex": 100, "big": 100}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gate:
+    """One number that the checkpoint is asked to reach with 4 views in distribution."""
+
+    metric: str
+    limit: float
+    at_least: bool
+
+    def reached(self, value: float) -> bool:
+        """Say whether a value is good enough."""
+        return value >= self.limit if self.at_least else value <= self.limit
+
+
+GATES = (
+    Gate(metric="auc30", limit=0.60, at_least=True),
+    Gate(metric="auc05", limit=0.08, at_least=True),
+    Gate(metric="fov_deg", limit=1.5, at_least=False),
+    Gate(metric="abs_rel", limit=0.11, at_least=False),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Per-room metrics of each mode."""
+
+    rooms: int
+    per_room: dict[str, dict[str, np.ndarray]]
+    """mode -> metric -> (rooms,)."""
+
+    def mean(self, mode: str) -> dict[str, float]:
+        """Return the mean of every metric over rooms."""
+        return {name: float(np.nanmean(values)) for name, values in self.per_room[mode].items()}
+
+    def gap(self, metric: str) -> Interval:
+        """Return the paired interval of "8->4" minus "4": what the held-out views are worth."""
+        return paired_interval(self.per_room["8->4"][metric] - self.per_room["4"][metric])
+
+
+def evaluate(
+    model: ReconstructionModel, domain: str, rooms: int, *, side: int, with_f1: bool = False, start: int = 0
+) -> Report:
+    """Score a model on the first rooms of a domain, rendered at the model's size (4:3, eight neighbouring frames)."""
+    scores: dict[str, list[dict[str, float]]] = {mode: [] for mode in MODES}
+    size = image_size(side, ASPECT, model.spec.patch_size)
+    for first in range(start, start + rooms, ROOMS_PER_BATCH):
+        batch = evaluation_rooms(domain, first, min(ROOMS_PER_BATCH, start + rooms - first), size)
+        for mode, views, prediction in predictions(model, batch):
+            scores[mode] += [score_room(prediction, batch, room, views, with_f1) for room in range(len(batch.images))]
+    per_room = {mode: {k: np.array([row[k] for row in rows]) for k in rows[0]} for mode, rows in scores.items()}
+    return Report(rooms=rooms, per_room=per_room)
+
+
+@lru_cache(maxsize=8)
+def evaluation_rooms(domain: str, first: int, count: int, size: tuple[int, int]) -> Rooms:
+    """Render some rooms of a domain; a training run scores the same ones again and again."""
+    return render_rooms(get_domain(domain).seeds(count, start=first), domain, ALL_VIEWS, size)
+
+
+@torch.no_grad()
+def predictions(model: ReconstructionModel, batch: Rooms) -> Iterator[tuple[str, Sequence[int], Prediction]]:
+    """Predict each mode for a batch of rooms; the images are embedded once."""
+    tokens = model.embed(batch.images.float() / 255)
+    all_features = model.aggregate(tokens)
+    every = list(range(ALL_VIEWS))
+    yield "4", KEPT, model.decode(model.aggregate(tokens.select(KEPT)))
+    yield "8->4", KEPT, model.decode(all_features.select(KEPT))
+    yield "8", every, model.decode(all_features)
+
+
+def score_room(
+    prediction: Prediction, truth: Rooms, room: int, views: Sequence[int], with_f1: bool
+) -> dict[str, float]:
+    """Return all metrics of one room."""
+    views = list(views)
+    depth_z, K, T_cam_world = (given(part)[room] for part in (prediction.depth_z, prediction.K, prediction.T_cam_world))
+    errors = pair_errors(T_cam_world, truth.T_cam_world[room, views])
+    depth_true = truth.depth_z[room].float()
+    height, width = depth_true.shape[-2:]
+    fov = 2 * torch.atan(width / 2 / K[:, 0, 0])
+    scores = pose_auc(errors.worst_deg) | {
+        "rotation_deg": float(errors.rotation_deg.median()),
+        "translation_deg": float(errors.translation_deg.median()),
+        "fov_deg": float((fov - truth.fov_vh[room, views, 1]).abs().mean().rad2deg()),
+        "abs_rel": float(score_depth(depth_z, depth_true[views]).abs_rel),
+    }
+    if with_f1:
+        K_true = K_from_fov(*truth.fov_vh[room].unbind(-1), (height, width))
+        T_true = truth.T_cam_world[room]
+        cloud = f1_rel5(depth_z, K, T_cam_world, depth_true, K_true, T_true, views=tuple(views))
+        scores["f1"] = cloud.fscore
+    return {name: float(value) for name, value in scores.items()}
+
+
+def zero_motion_rotation_deg(truth: Rooms) -> float:
+    """Return the rotation error of a model that never moves: the number a learning model has to beat."""
+    still = torch.eye(4).expand_as(truth.T_cam_world)
+    return float(pair_errors(se3.inverse(still), truth.T_cam_world).rotation_deg.median())
+
+
+def report_card(
+    model: ReconstructionModel, path: Path, *, side: int, domains: Mapping[str, int] = DOMAIN_ROOMS
+) -> dict[str, Any]:
+    """Score a checkpoint on domains (name -> rooms), the first one in distribution; write JSON and return it.
+
+    Per domain: means of every metric in each mode, intervals of 8->4 minus 4, and whether the premise holds, which
+    means that every one of `PREMISE_METRICS` has an interval above zero. `gates` judges the first domain at 4 views.
+    """
+    card: dict[str, Any] = {"side": side, "kept": list(KEPT), "domains": {}}
+    for domain, rooms in domains.items():
+        report = evaluate(model, domain, rooms, side=side, with_f1=True)
+        gaps = {metric: report.gap(metric) for metric in GAP_METRICS}
+        card["domains"][domain] = {
+            "rooms": rooms,
+            "mean": {mode: report.mean(mode) for mode in MODES},
+            "gap": {metric: gap._asdict() for metric, gap in gaps.items()},
+            "premise": all(gaps[metric].low > 0 for metric in PREMISE_METRICS),
+        }
+    first = next(iter(card["domains"].values()))["mean"]["4"]
+    card["gates"] = {
+        gate.metric: {"value": first[gate.metric], "limit": gate.limit, "reached": gate.reached(first[gate.metric])}
+        for gate in GATES
+    }
+    write_json(path, card)
+    return card
+
+
+def card_tables(card: Mapping[str, Any]) -> str:
+    """Return a report card as two Markdown tables: quality, and what the held-out views are worth."""
+    columns = ("auc30", "auc15", "auc05", "auc03", "rotation_deg", "translation_deg", "fov_deg", "abs_rel", "f1")
+    digits = {name: 2 if name.endswith("_deg") else 3 for name in columns}
+    lines = ["| domain (rooms) | mode | " + " | ".join(columns) + " |", "|---" * (len(columns) + 2) + "|"]
+    for domain, entry in card["domains"].items():
+        for mode in MODES:
+            values = " | ".join(f"{entry['mean'][mode][name]:.{digits[name]}f}" for name in columns)
+            lines.append(f"| {domain} ({entry['rooms']}) | {mode} | {values} |")
+    lines += ["", "| domain | " + " | ".join(GAP_METRICS) + " | premise |", "|---" * (len(GAP_METRICS) + 2) + "|"]
+    for domain, entry in card["domains"].items():
+        cells = [f"{gap['mean']:+.3f} [{gap['low']:+.3f}, {gap['high']:+.3f}]" for gap in entry["gap"].values()]
+        lines.append(f"| {domain} | " + " | ".join(cells) + f" | {'yes' if entry['premise'] else 'no'} |")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,187 @@
+"""What a training run consists of at any moment: weights, their average, optimisers, counters; shareable, storable."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+from freegeo.models.catalog import EMBEDDED_MODEL, build_empty
+from freegeo.models.da3 import DA3, Backbone
+from freegeo.models.da3_presets import keys
+from freegeo.models.transformer import Block, initialise
+from freegeo.storage import atomic_path
+from freegeo.training.config import TrainConfig
+from freegeo.training.muon import Muon
+from freegeo.training.objective import ReadOuts
+
+logger = logging.getLogger(__name__)
+
+STATE, PLATEAU = "state.pt", "plateau.pt"
+FIRST_FOV_RAD = 1.0
+MUON_PARTS = ("backbone.pretrained.blocks.", "cam_dec.backbone.")
+PLATEAU_LR = "plateau_lr"
+"""Key of a parameter group's learning rate before the schedule's factor."""
+
+
+@dataclass
+class State:
+    """Everything that changes during training; after `share` several processes work on the same numbers."""
+
+    model: DA3
+    read_outs: ReadOuts
+    average: dict[str, Tensor]
+    optimisers: tuple[Muon, torch.optim.AdamW]
+    counters: Tensor
+    """(3,) float64: steps begun, views learned from, seconds of processor time; on the CPU."""
+
+    @property
+    def step(self) -> int:
+        """Steps begun."""
+        return int(self.counters[0])
+
+    @property
+    def seen(self) -> int:
+        """Views learned from."""
+        return int(self.counters[1])
+
+    @property
+    def cpu_seconds(self) -> float:
+        """Processor time of all workers."""
+        return float(self.counters[2])
+
+    def parameters(self) -> list[nn.Parameter]:
+        """Return all parameters that learn."""
+        return [*self.model.parameters(), *self.read_outs.parameters()]
+
+    def tensors(self) -> dict[str, Any]:
+        """Return the state as plain tensors and numbers."""
+        return {
+            "model": self.model.state_dict(),
+            "read_outs": self.read_outs.state_dict(),
+            "average": self.average,
+            "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
+            "counters": self.counters,
+        }
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Take over what `tensors` returned."""
+        self.model.load_state_dict(saved["model"])
+        self.read_outs.load_state_dict(saved["read_outs"])
+        for name, value in saved["average"].items():
+            self.average[name].copy_(value)
+        for optimiser, values in zip(self.optimisers, saved["optimisers"], strict=True):
+            optimiser.load_state_dict(values)
+        self.counters.copy_(saved["counters"])
+
+    def share(self) -> None:
+        """Move all numbers to memory that other processes can write to as well."""
+        self.model.share_memory()
+        self.read_outs.share_memory()
+        for value in (self.counters, *self.average.values()):
+            value.share_memory_()
+        for optimiser in self.optimisers:
+            for values in optimiser.state.values():
+                for tensor in values.values():
+                    tensor.share_memory_()
+
+
+def new_state(config: TrainConfig, device: torch.device | str = "cpu") -> State:
+    """Build model, training-only read-outs and optimisers from the seed."""
+    generator = torch.Generator().manual_seed(config.seed)
+    model = cast(DA3, build_empty(EMBEDDED_MODEL).to_empty(device="cpu"))
+    reset_norms(model)
+    initialise(model, generator)
+    seek_alike(model)
+    start_camera_decoder(model)
+    read_outs = ReadOuts(model.config.channels)
+    initialise(read_outs, generator)
+    model, read_outs = model.to(device), read_outs.to(device)
+    average = {name: value.detach().clone() for name, value in model.named_parameters()}
+    optimisers = build_optimisers(model, read_outs, config)
+    return State(model, read_outs, average, optimisers, torch.zeros(3, dtype=torch.float64))
+
+
+def reset_norms(model: nn.Module) -> None:
+    """Give norms and layer scales their neutral values."""
+    for name, parameter in model.named_parameters():
+        if parameter.ndim == 1:
+            nn.init.constant_(parameter, 0.0 if name.endswith("bias") else 1.0)
+
+
+@torch.no_grad()
+def seek_alike(model: DA3) -> None:
+    """Start the global blocks with equal queries and keys: a token first attends to tokens like itself."""
+    backbone = cast(Backbone, model.backbone["pretrained"])
+    for index, block in enumerate(backbone.blocks):
+        if backbone.is_global(index):
+            query, key, _ = cast(Block, block).attn.qkv.weight.chunk(3)
+            key.copy_(query)
+
+
+@torch.no_grad()
+def start_camera_decoder(model: DA3) -> None:
+    """Let the camera decoder answer "standing still, common lens" at first.
+
+    Its last layers start at zero: the field of view ends in a rectifier, which a random start can switch off for ever.
+    """
+    for layer in (model.cam_dec.fc_t, model.cam_dec.fc_qvec, cast(nn.Linear, model.cam_dec.fc_fov[0])):
+        nn.init.zeros_(layer.weight)
+    cast(nn.Linear, model.cam_dec.fc_fov[0]).bias.fill_(FIRST_FOV_RAD)
+    model.cam_dec.fc_qvec.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 1.0]))
+
+
+def build_optimisers(model: DA3, read_outs: ReadOuts, config: TrainConfig) -> tuple[Muon, torch.optim.AdamW]:
+    """Split the parameters: inner matrices to Muon, everything else to AdamW; all their memory exists at once."""
+    matrices, others, top = [], [], list(read_outs.parameters())
+    for name, parameter in model.named_parameters():
+        if parameter.ndim == 2 and name.startswith(MUON_PARTS):
+            matrices.append(parameter)
+        else:
+            (top if name.startswith(("cam_dec.", "head.")) else others).append(parameter)
+    groups = [{"params": others, "lr": config.other_lr}, {"params": top, "lr": config.head_lr}]
+    adamw = torch.optim.AdamW(groups, weight_decay=0.01, fused=True)
+    for parameter in (*others, *top):
+        adamw.state[parameter] = {
+            "step": torch.zeros((), device=parameter.device),
+            "exp_avg": torch.zeros_like(parameter),
+            "exp_avg_sq": torch.zeros_like(parameter),
+        }
+    muon = Muon(matrices, lr=config.matrix_lr)
+    for group in (*muon.param_groups, *adamw.param_groups):
+        group[PLATEAU_LR] = group["lr"]
+    return muon, adamw
+
+
+def averaged(state: State) -> DA3:
+    """Return a model with the averaged weights, on the CPU."""
+    model = cast(DA3, build_empty(EMBEDDED_MODEL))
+    aliases = {alias: state.average[stored] for alias, stored in keys().aliases.items()}
+    weights = state.model.state_dict() | state.average | aliases
+    model.load_state_dict({name: value.cpu() for name, value in weights.items()}, assign=True)
+    return model.requires_grad_(False).eval()
+
+
+def resume(state: State, config: TrainConfig, folder: Path) -> None:
+    """Continue from the newest state that fits the view budget."""
+    for name in (STATE, PLATEAU):
+        path = folder / name
+        if not path.is_file():
+            continue
+        saved = torch.load(path, weights_only=True, map_location=next(state.model.parameters()).device)
+        cooling = name == STATE and saved["counters"][1] > saved["cooldown_start"]
+        if cooling and saved["cooldown_start"] < config.cooldown_start:
+            continue
+        state.restore(saved)
+        logger.info("resumed %s at %d views", path, state.seen)
+        return
+
+
+def save(state: State, config: TrainConfig, path: Path) -> None:
+    """Write the whole state atomically."""
+    with atomic_path(path) as part:
+        torch.save({**state.tensors(), "cooldown_start": config.cooldown_start}, part)

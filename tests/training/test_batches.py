@@ -1,0 +1,85 @@
+import itertools
+
+import pytest
+import torch
+
+from freegeo.geometry import se3
+from freegeo.training.batches import augment, shrink, to_batch, window
+from freegeo.training.config import TrainConfig
+from freegeo.training.objective import cell_targets, partners
+
+
+def test_windows_are_evenly_spaced_inside_and_go_both_ways():
+    generator = torch.Generator().manual_seed(0)
+    seen = [window(10, 4, 3, generator) for _ in range(200)]
+    for frames in seen:
+        strides = {b - a for a, b in itertools.pairwise(frames)}
+        assert len(strides) == 1
+        assert min(frames) >= 0 and max(frames) <= 9
+    assert {abs(frames[1] - frames[0]) for frames in seen} == {1, 2, 3}
+    assert {frames[1] > frames[0] for frames in seen} == {True, False}
+    assert window(8, 8, 3, generator) in (list(range(8)), list(range(7, -1, -1)))
+
+
+def test_samples_live_in_the_first_camera_and_in_mean_depths(rooms):
+    batch = to_batch(rooms)
+    torch.testing.assert_close(batch.T_world_cam[:, 0], torch.eye(4).expand(2, 4, 4), atol=1e-5, rtol=0)
+    torch.testing.assert_close(batch.depth_z.mean(dim=(1, 2, 3)), torch.ones(2))
+    scale = rooms.depth_z.float().mean(dim=(1, 2, 3))
+    metric = se3.inverse(rooms.T_cam_world)[..., :3, 3]
+    baseline = (metric[:, 1:] - metric[:, :1]).norm(dim=-1) / scale[:, None]
+    torch.testing.assert_close(batch.T_world_cam[:, 1:, :3, 3].norm(dim=-1), baseline, atol=1e-4, rtol=1e-4)
+
+
+def patch_colours(batch, grid_hw):
+    """Mean brightness of every patch, (B, S, P)."""
+    grey = batch.images.mean(2)
+    return torch.nn.functional.adaptive_avg_pool2d(grey, grid_hw).flatten(2)
+
+
+@pytest.mark.parametrize("change", ["none", "augment", "shrink"])
+def test_partner_patches_show_the_same_thing(rooms, change):
+    batch = to_batch(rooms)
+    batch = augment(batch, torch.Generator().manual_seed(3)) if change == "augment" else batch
+    batch = shrink(batch, 0.75, 8) if change == "shrink" else batch
+    grid = (batch.images.shape[-2] // 8, batch.images.shape[-1] // 8)
+    target, visible = partners(batch, grid, torch.tensor([0, 1]), torch.tensor([1, 2]))
+    assert visible.float().mean() > 0.3
+    colours = patch_colours(batch, grid)
+    here, there = colours[:, [0, 1]], colours[:, [1, 2]]
+    other = there.roll(7, dims=-1).gather(-1, target)
+    partner = there.gather(-1, target)
+    right, wrong = ((x - here).abs()[visible].mean() for x in (partner, other))
+    assert right < 0.6 * wrong
+
+
+def test_a_mirrored_sample_is_still_one_world(rooms):
+    batch = to_batch(rooms)
+    tries = (augment(batch, torch.Generator().manual_seed(seed)) for seed in range(100))
+    unchanged = (
+        (changed, [torch.equal(a, b) for a, b in zip(batch.depth_z, changed.depth_z, strict=True)]) for changed in tries
+    )
+    changed, mirrored = next((changed, [not same for same in kept]) for changed, kept in unchanged if sum(kept) == 1)
+    first = mirrored.index(True)
+    before, after = cell_targets(batch, 8).point[first], cell_targets(changed, 8).point[first]
+    # Cells sit half a pixel right of the middle of an even patch, so a mirrored cell is off by one pixel.
+    flipped = before.flip(2) * torch.tensor([-1.0, 1.0, 1.0])
+    assert (flipped - after).norm(dim=-1).median() < 0.05
+    determinant = torch.linalg.det(changed.T_world_cam[..., :3, :3])
+    torch.testing.assert_close(determinant, torch.ones_like(determinant))
+
+
+def test_stages_grow_longer_and_larger():
+    config = TrainConfig()
+    stages = [config.stage(seen) for seen in (0, 30_000, 70_000, 200_000)]
+    assert [max(stage.views) for stage in stages] == sorted(max(stage.views) for stage in stages)
+    assert [stage.side for stage in stages] == [48, 48, 48, 64]
+
+
+def test_rate_warms_up_stays_and_cools_down():
+    config = TrainConfig(views=100_000, warmup_views=1000, cooldown=0.2)
+    assert config.rate(0) == 0
+    assert config.rate(500) == pytest.approx(0.5)
+    assert config.rate(1000) == config.rate(80_000) == 1
+    assert config.rate(90_000) == pytest.approx(0.5)
+    assert config.rate(100_000) == 0

@@ -1,0 +1,142 @@
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+import torch
+from safetensors import safe_open
+
+from freegeo.errors import FreeGeoError, UserError
+from freegeo.models.catalog import load_model
+from freegeo.storage import read_json
+from freegeo.training import loop, state
+from freegeo.training.loop import train
+
+pytestmark = pytest.mark.usefixtures("small_shards")
+
+KILLED_RUN = """
+import os, signal, sys
+from pathlib import Path
+from freegeo.training import loop, pool
+from freegeo.training.config import TrainConfig
+pool.ROOMS_PER_SHARD = 2
+loop.SAVE_EVERY_S = 0.0
+def progress(state):
+    if state.step == 4:
+        os.kill(os.getpid(), signal.SIGKILL)
+loop.train(TrainConfig(views=40, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1), Path(sys.argv[1]),
+           progress=progress)
+"""
+
+
+def tensors(path):
+    with safe_open(path, "pt") as file:
+        return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+
+
+@pytest.fixture
+def whole_run(tmp_path, small_config):
+    return train(small_config, tmp_path / "whole")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
+def test_a_killed_run_ends_with_the_same_tensors(tmp_path, small_config, whole_run):
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    killed = subprocess.run([sys.executable, "-c", KILLED_RUN, str(tmp_path / "killed")], env=environment, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    saved = torch.load(tmp_path / "killed" / state.STATE, weights_only=True)
+    assert 0 < saved["counters"][0] <= 4
+    weights = train(small_config, tmp_path / "killed")
+    expected, found = tensors(whole_run), tensors(weights)
+    assert expected.keys() == found.keys()
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+
+
+def test_a_larger_budget_goes_on_from_the_plateau(tmp_path, small_config, whole_run):
+    from dataclasses import replace
+
+    folder = whole_run.parent
+    plateau = torch.load(folder / state.PLATEAU, weights_only=True)
+    assert 30 <= plateau["counters"][1] < 40
+    steps = []
+    larger = replace(small_config, views=60)
+    train(larger, folder, progress=lambda now: steps.append((now.step, now.seen)))
+    # The steps after the plateau are taken again, now without the cool-down, and the new budget is used up.
+    assert steps[0][0] == plateau["counters"][0] + 1
+    assert steps[-1][1] >= 60
+
+
+def test_other_settings_need_another_folder(small_config, whole_run):
+    from dataclasses import replace
+
+    with pytest.raises(UserError, match="another seed"):
+        train(replace(small_config, seed=7), whole_run.parent)
+
+
+def test_the_weight_file_is_a_checkpoint_of_the_embedded_model(whole_run):
+    model = load_model("freegeo-tiny", checkpoint=whole_run)
+    prediction = model.decode(model.aggregate(model.embed(torch.rand(1, 3, 3, 48, 64))))
+    assert torch.isfinite(prediction.depth_z).all()
+    assert torch.isfinite(prediction.T_cam_world).all()
+    with safe_open(whole_run, "pt") as file:
+        assert int(file.metadata()["views"]) >= 40
+        assert int(file.metadata()["cpu_seconds"]) > 0
+    assert whole_run.stat().st_size < 20e6
+
+
+def test_a_leg_stops_in_time_and_is_resumed(tmp_path, small_config):
+    seen = []
+    train(small_config, tmp_path / "legs", minutes=0.0, progress=lambda now: seen.append(now.step))
+    assert not seen
+    assert (tmp_path / "legs" / state.STATE).is_file()
+
+
+def test_two_workers_learn_on_the_same_weights(tmp_path, small_config):
+    by_first_process = []
+    weights = train(small_config, tmp_path / "two", workers=2, progress=lambda now: by_first_process.append(now.seen))
+    saved = torch.load(tmp_path / "two" / state.STATE, weights_only=True)
+    assert saved["counters"][1] >= 40
+    assert all(torch.isfinite(value).all() for value in tensors(weights).values())
+    assert read_json(tmp_path / "two" / loop.CONFIG)["views"] == 40
+
+
+def test_several_workers_are_for_the_processor_only(tmp_path, small_config):
+    with pytest.raises(UserError, match="cannot train with 2 workers on cuda"):
+        train(small_config, tmp_path, workers=2, device="cuda")
+
+
+def test_a_broken_loss_stops_before_the_step_and_is_named(tmp_path, small_config, monkeypatch):
+    def broken(*arguments):
+        return {"depth": torch.tensor(float("nan"), requires_grad=True), "rays": torch.tensor(1.0)}
+
+    monkeypatch.setattr(loop, "objective", broken)
+    with pytest.raises(FreeGeoError, match="training step 0: depth not finite"):
+        train(small_config, tmp_path)
+    assert not (tmp_path / loop.WEIGHTS).exists()
+
+
+def test_global_blocks_first_look_for_tokens_like_themselves(small_config):
+    model = state.new_state(small_config).model
+    backbone = model.backbone["pretrained"]
+    for index, block in enumerate(backbone.blocks):
+        query, key, _ = block.attn.qkv.weight.chunk(3)
+        assert torch.equal(query, key) == backbone.is_global(index)
+
+
+def test_a_fresh_model_stands_still_with_a_common_lens(small_config):
+    model = state.new_state(small_config).model
+    features = model.aggregate(model.embed(torch.rand(1, 3, 3, 48, 64)))
+    encoding = model.cam_dec(features.levels[9][1][..., 0, :])
+    expected = torch.tensor([0.0, 0, 0, 0, 0, 0, 1, state.FIRST_FOV_RAD, state.FIRST_FOV_RAD])
+    torch.testing.assert_close(encoding, expected.expand(1, 3, 9))
+    assert model.decode(features).depth_z.log().std() > 1e-3
+
+
+def test_every_parameter_is_in_one_group_with_its_rate(small_config):
+    built = state.new_state(small_config)
+    groups = [group for optimiser in built.optimisers for group in optimiser.param_groups]
+    listed = [parameter for group in groups for parameter in group["params"]]
+    assert len(listed) == len({id(parameter) for parameter in listed}) == len(built.parameters())
+    rates = {small_config.matrix_lr, small_config.other_lr, small_config.head_lr}
+    assert {group[state.PLATEAU_LR] for group in groups} == rates
