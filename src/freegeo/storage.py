@@ -1,16 +1,17 @@
 """Writing so that nothing is lost: files appear whole or not at all, folders are locked, runs continue.
 
 A command's output folder goes through three states: absent, unfinished (its settings are stored, its parts appear one
-by one) and finished (the marker names when). Only the standard library is used here.
+by one) and finished (the marker names when). A ledger in the folder lists what freegeo wrote there, so that replacing a
+result never touches a file that somebody put beside it. Only the standard library is used here.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import secrets
-import shutil
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -22,6 +23,10 @@ from freegeo.errors import FreeGeoError, UserError
 FORMAT = 1
 STATE_FILE = ".freegeo-run.json"
 LOCK_FILE = ".freegeo-lock"
+LEDGER_FILE = ".freegeo-files"
+_OWN_FILES = frozenset({STATE_FILE, LOCK_FILE, LEDGER_FILE})
+_SHOWN = 4
+_PART = re.compile(r"\..+\.[0-9a-f]{8}\.part(\..*)?")
 
 
 @contextmanager
@@ -36,6 +41,7 @@ def atomic_path(path: Path) -> Generator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
         _flush(temporary)
+        _enter_in_ledger(path)
         temporary.replace(path)
     except PermissionError:
         raise UserError(f"{path.parent}: the folder cannot be written to. Choose another output folder.") from None
@@ -50,6 +56,15 @@ def _flush(path: Path) -> None:
     mask = os.umask(0)
     os.umask(mask)
     path.chmod(0o666 & ~mask)
+
+
+def _enter_in_ledger(path: Path) -> None:
+    """Note a file in the ledger of the run folder that it lies in, if it lies in one."""
+    path = path.absolute()
+    owner = next((folder for folder in path.parents if (folder / STATE_FILE).is_file()), None)
+    if owner is not None and path.name not in _OWN_FILES:
+        with (owner / LEDGER_FILE).open("a", encoding="utf-8") as file:
+            file.write(path.relative_to(owner).as_posix() + "\n")
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -85,21 +100,33 @@ def write_tensors(path: Path, tensors: Mapping[str, Any], metadata: Mapping[str,
 
 @contextmanager
 def locked(folder: Path) -> Generator[None]:
-    """Hold a folder against other processes; the lock goes with the process, however it ends."""
+    """Hold a folder against other processes; the lock goes with the process, however it ends.
+
+    UserError when the folder cannot be made or written to, or when another process holds it.
+    """
+    lock = folder / LOCK_FILE
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = (folder / LOCK_FILE).open("a+b")
-    except (PermissionError, NotADirectoryError, FileExistsError, OSError) as error:
+        handle = lock.open("a+b")
+    except OSError as error:
         raise UserError(
             f"{folder}: the output folder cannot be written to ({error.strerror}). Choose another one."
         ) from None
     with handle:
-        if not _try_lock(handle):
+        # A lock on a file that its last holder has just removed would protect nothing.
+        if not _try_lock(handle) or not _is_same_file(handle, lock):
             raise UserError(f"{folder}: another freegeo process is writing here. Wait for it or choose another folder.")
         try:
             yield
         finally:
-            (folder / LOCK_FILE).unlink(missing_ok=True)
+            lock.unlink(missing_ok=True)
+
+
+def _is_same_file(handle, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(handle.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def _try_lock(handle) -> bool:
@@ -145,18 +172,40 @@ def run_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool = Fal
 
     Absent or empty: it is started. Unfinished with the same settings: it goes on. Finished with the same settings:
     `finished` is true and the caller leaves it alone. Other settings, or a folder that freegeo did not write:
-    UserError, unless `overwrite`, which removes what an earlier run wrote (a foreign folder is never removed).
+    UserError, unless `overwrite`, which removes what earlier runs wrote (and nothing else; a foreign folder is refused
+    all the same). A block that is refused before it wrote anything leaves no trace.
     """
     settings = json.loads(json.dumps(settings))
     check_folder(path, settings, overwrite=overwrite)
-    with locked(path):
-        before = stored_state(path)
-        if before is not None and (overwrite or before["settings"] != settings):
-            clear(path)
-            before = None
-        if before is None:
-            write_json(path / STATE_FILE, _state(settings, None))
-        yield RunFolder(path, settings, before["finished"] if before else None)
+    is_new = not path.exists()
+    try:
+        with locked(path):
+            finished_at = _open(path, settings, overwrite)
+            try:
+                yield RunFolder(path, settings, finished_at)
+            except UserError:
+                if not _ledger(path):
+                    (path / STATE_FILE).unlink(missing_ok=True)
+                raise
+    finally:
+        if is_new and path.is_dir() and not any(path.iterdir()):
+            path.rmdir()
+
+
+def _open(path: Path, settings: Mapping[str, Any], overwrite: bool) -> str | None:
+    """Start or continue the run of a locked folder; returns when it was finished."""
+    # The state is read again under the lock: another process may have changed it since the check.
+    check_folder(path, settings, overwrite=overwrite)
+    before = stored_state(path)
+    if before is not None and overwrite:
+        clear(path)
+        before = None
+    if before is None:
+        write_json(path / STATE_FILE, _state(settings, None))
+        return None
+    if not before["finished"]:
+        _remove_parts(path)
+    return before["finished"]
 
 
 def check_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool) -> None:
@@ -166,7 +215,7 @@ def check_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool) ->
         raise UserError(f"{path}: is a file. Choose a folder for the output.")
     before = stored_state(path)
     if before is None:
-        if path.is_dir() and any(p.name != LOCK_FILE for p in path.iterdir()):
+        if path.is_dir() and any(p.name not in _OWN_FILES for p in path.iterdir()):
             raise UserError(f"{path}: holds files that freegeo did not write. Choose an empty or a new folder.")
         _require_writable(path)
         return
@@ -184,15 +233,45 @@ def check_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool) ->
 def stored_state(path: Path) -> dict[str, Any] | None:
     """Return format, settings and finishing time of the run a folder holds; None when it holds none."""
     file = path / STATE_FILE
-    return read_json(file) if file.is_file() else None
+    if not file.is_file():
+        return None
+    state = read_json(file)
+    if not isinstance(state, dict) or not {"format", "settings", "finished"} <= set(state):
+        raise FreeGeoError(f"{file}: not the state of a run. Choose another output folder.")
+    return state
 
 
 def clear(path: Path) -> None:
-    """Remove an earlier run's files from a folder that freegeo wrote."""
-    for item in path.iterdir():
-        if item.name == LOCK_FILE:
-            continue
-        shutil.rmtree(item) if item.is_dir() and not item.is_symlink() else item.unlink()
+    """Remove what earlier runs wrote into a folder, and nothing that anybody else put there."""
+    state = stored_state(path)
+    if state is not None:
+        # Should the removal be cut short, what is left must not pass for a finished result.
+        write_json(path / STATE_FILE, {**state, "finished": None})
+    files = [path / name for name in _ledger(path)]
+    for file in files:
+        if file.is_symlink() or file.is_file():
+            file.unlink()
+    _remove_parts(path)
+    inner = {folder for file in files for folder in file.parents if path in folder.parents}
+    for folder in sorted(inner, key=lambda f: len(f.parts), reverse=True):
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+    (path / LEDGER_FILE).unlink(missing_ok=True)
+
+
+def _ledger(path: Path) -> list[str]:
+    """Names of the files that freegeo wrote below a folder, each once."""
+    file = path / LEDGER_FILE
+    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+    return [name for name in dict.fromkeys(lines) if ".." not in Path(name).parts and not Path(name).is_absolute()]
+
+
+def _remove_parts(path: Path) -> None:
+    """Remove the half-written files of a process that was killed."""
+    for folder in {path, *((path / name).parent for name in _ledger(path))}:
+        for file in folder.glob(".*.part*"):
+            if _PART.fullmatch(file.name):
+                file.unlink()
 
 
 def _state(settings: Mapping[str, Any], finished: str | None) -> dict[str, Any]:
@@ -205,19 +284,25 @@ def _require_writable(path: Path) -> None:
         raise UserError(f"{path}: the output folder cannot be written to. Choose another one.")
 
 
-def _difference(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> str:
-    parts = []
+def _difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    parts = list(_differences(before, now))
+    more = len(parts) - _SHOWN
+    return "; ".join(parts[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
+
+
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     for name in sorted(set(before) | set(now)):
         old, new = before.get(name), now.get(name)
-        if old == new:
-            continue
         if isinstance(old, dict) and isinstance(new, dict):
-            parts.append(_difference(old, new, f"{prefix}{name}."))
-        else:
-            parts.append(f"{prefix}{name}: {_short(old)} there, {_short(new)} now")
-    return "; ".join(parts)
+            yield from _differences(old, new, f"{prefix}{name}.")
+        elif old != new:
+            yield f"{prefix}{name}: {_short(old)} there, {_short(new)} now"
 
 
 def _short(value: Any) -> str:
-    text = json.dumps(value)
+    if value is None:
+        return "none"
+    if isinstance(value, dict):
+        return f"'{value['name']}'" if "name" in value else "given"
+    text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= 60 else f"{text[:57]}..."

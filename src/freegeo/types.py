@@ -5,6 +5,7 @@ Letters: B batch, S views, H W pixels, P patches, N tokens, T special tokens, C 
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Protocol, Self
@@ -50,7 +51,7 @@ class ImageBatch:
     scale_xy: Tensor
     """(S, 2) float64."""
     offset_xy: Tensor
-    """(S, 2) float64: minus the cropped pixels."""
+    """(S, 2) float64: negative where the photo is cropped, positive where it is padded."""
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -61,6 +62,10 @@ class ImageBatch:
         index = torch.as_tensor(list(views), dtype=torch.long)
         tensors = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "names"}
         return replace(self, names=tuple(self.names[i] for i in views), **tensors)
+
+    def digest(self) -> str:
+        """Return a fingerprint of the pixels, which tells photos of the same names apart."""
+        return hashlib.sha256(self.images.contiguous().numpy().tobytes()).hexdigest()[:16]
 
     def photo_K(self, K: Tensor) -> Tensor:
         """Turn intrinsics (S, 3, 3) of the model's images into those of the original photos."""

@@ -1,5 +1,6 @@
 """Checkpoints load strictly, whatever their container; what does not fit or is damaged gives one clear sentence."""
 
+import logging
 import subprocess
 import sys
 from pathlib import Path
@@ -221,25 +222,54 @@ def test_totals_are_those_of_the_fact_sheets():
     assert {name: catalog.entry(name).parameters for name in sheet} == sheet
 
 
-def test_failed_download_says_what_to_do(monkeypatch):
+@pytest.fixture
+def hub(monkeypatch):
+    """The hub library without a network or a cache: what it was asked for, and whether the hub answers."""
     import huggingface_hub
     from huggingface_hub.errors import LocalEntryNotFoundError
 
-    asked = []
+    class Hub:
+        answers, cached, asked = True, None, []
 
-    def offline(*where):
-        asked.append(where)
+    def metadata(url, *, timeout):
+        assert timeout <= 10
+        if not Hub.answers:
+            logging.getLogger("huggingface_hub.utils").warning("noise")
+            raise catalog._http_error()("no route to the hub")
+
+    def download(*where):
+        Hub.asked = [*Hub.asked, where]
         raise LocalEntryNotFoundError("offline")
 
-    monkeypatch.setattr(huggingface_hub, "hf_hub_download", offline)
+    monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", lambda *where: Hub.cached)
+    monkeypatch.setattr(huggingface_hub, "get_hf_file_metadata", metadata)
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", download)
+    return Hub
+
+
+def test_failed_download_says_what_to_do(hub):
     with pytest.raises(UserError, match=r"Go online and run `freegeo models download vggt-1b`"):
         catalog.load_model("vggt-1b")
     with pytest.raises(UserError, match=r"Accept its licence at https://huggingface\.co/facebook/VGGT-1B-Commercial"):
         catalog.load_model("vggt-1b-commercial")
-    assert asked == [
+    assert hub.asked == [
         ("facebook/VGGT-1B", "model.safetensors"),
         ("facebook/VGGT-1B-Commercial", "vggt_1B_commercial.pt"),
     ]
+
+
+def test_unreachable_hub_is_noticed_before_the_download_and_without_noise(hub, caplog):
+    hub.answers = False
+    with pytest.raises(UserError, match="could not be downloaded"):
+        catalog.download("da3-small")
+    assert hub.asked == []
+    assert "noise" not in caplog.text
+    assert logging.getLogger("huggingface_hub").level != logging.CRITICAL
+
+
+def test_downloaded_checkpoint_needs_no_network(hub):
+    hub.answers, hub.cached = False, "/cache/model.safetensors"
+    assert catalog.download("da3-small").as_posix() == "/cache/model.safetensors"
 
 
 def test_listing_models_does_not_import_torch():

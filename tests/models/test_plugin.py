@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from safetensors.torch import save_file
 
 import freegeo
 from freegeo.adaptation.adapter import count_trainable
@@ -16,7 +17,7 @@ from freegeo.adaptation.adapter_files import load_adapter, save_adapter
 from freegeo.adaptation.published import export_published
 from freegeo.adaptation.recipe import released
 from freegeo.adaptation.trainer import adapt
-from freegeo.errors import UserError
+from freegeo.errors import FreeGeoError, UserError
 from freegeo.models import catalog
 from freegeo.models.api import ReconstructionModel
 from tiny_models import noise, noise_scene, outputs, quick, same, trained
@@ -64,6 +65,13 @@ def test_the_catalog_lists_it_after_our_own_models():
         catalog.entry("toys")
 
 
+def test_an_entry_point_that_names_something_else_is_refused(monkeypatch):
+    point = importlib.metadata.EntryPoint("broken", "freegeo_toy:LICENCE", catalog.PLUGIN_GROUP)
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda *, group: [point])
+    with pytest.raises(FreeGeoError, match=r"plug-in 'broken' \(freegeo_toy:LICENCE\) is no ModelEntry"):
+        catalog.entry("broken")
+
+
 def test_listing_it_does_not_import_its_architecture():
     catalog.entry("toy")
     assert "freegeo_toy.model" not in sys.modules
@@ -71,9 +79,7 @@ def test_listing_it_does_not_import_its_architecture():
 
 def test_it_loads_with_the_weights_it_ships():
     model = load()
-    from freegeo_toy.weights import draw
-
-    drawn = draw()
+    drawn = importlib.import_module("freegeo_toy.weights").draw()
     assert all(torch.equal(value, drawn[name].float()) for name, value in model.state_dict().items())
     assert (model.loaded_from.model, model.loaded_from.licence) == ("toy", "Apache-2.0")
     assert sum(parameter.numel() for parameter in model.parameters()) == catalog.entry("toy").parameters
@@ -81,10 +87,8 @@ def test_it_loads_with_the_weights_it_ships():
 
 
 def test_a_checkpoint_of_another_model_is_refused(tmp_path):
-    from safetensors.torch import save_file
-
     save_file({"stranger": torch.zeros(1)}, tmp_path / "other.safetensors")
-    with pytest.raises(UserError, match="does not fit toy.*missing.*1 unexpected"):
+    with pytest.raises(UserError, match=r"does not fit toy.*missing.*1 unexpected"):
         catalog.load_model("toy", checkpoint=tmp_path / "other.safetensors")
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from freegeo.cli import console
-from freegeo.cli.jobs import progress_hooks
+from freegeo.cli.jobs import progress_hooks, say_finished
 from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source, split_scenes
 
@@ -43,18 +43,19 @@ def adapt(
     from freegeo.pipeline import require_enough_photos, settings_of
     from freegeo.storage import check_folder, run_folder
 
-    scenes = {str(part[0]): load_source(part, photos.max_views) for part in split_scenes(sources or ("",))}
+    scenes = {str(part[0]): load_source(part, photos.max_views) for part in split_scenes(sources)}
     for found in scenes.values():
         require_enough_photos(found)
     loaded = model.load()
     plan = recipe.build(loaded.spec)
-    names = {name: [photo.name for photo in found] for name, found in scenes.items()}
-    settings = settings_of(plan, command="adapt", scenes=names, **model.settings(loaded))
+    batches = {name: loaded.preprocess(found) for name, found in scenes.items()}
+    about = {name: {"photos": list(batch.names), "contents": batch.digest()} for name, batch in batches.items()}
+    settings = settings_of(plan, command="adapt", scenes=about, **model.settings(loaded))
     check_folder(output.output, settings, overwrite=output.overwrite)
-    images = [SceneImages.from_batch(name, loaded.preprocess(found)) for name, found in scenes.items()]
+    images = [SceneImages.from_batch(name, batch) for name, batch in batches.items()]
     with run_folder(output.output, settings, overwrite=output.overwrite) as folder:
         if folder.finished:
-            console.say(f"{output.output}: already finished on {folder.finished_at}; nothing to do.")
+            say_finished(output.output, folder.finished_at)
             return
         _train(loaded, images, plan, model, folder.path)
         folder.finish()

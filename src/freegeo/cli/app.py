@@ -1,18 +1,32 @@
-"""The program `freegeo`: commands load on use, so that help needs no torch."""
+"""The program `freegeo`: commands load on use, so that help needs no torch.
+
+`--config FILE.toml` sets options that the command line leaves out. The file has one table per command, named like it,
+with the long names of the options without their dashes; a switch is true or false:
+
+    [run]
+    model = "da3-giant"
+    steps = 50
+    adapt = true
+"""
 
 from __future__ import annotations
 
 import os
 import sys
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-
-import cyclopts
-from cyclopts import App
+from typing import TYPE_CHECKING
 
 from freegeo import __version__
+from freegeo.cli import console
 from freegeo.errors import FreeGeoError, UserError
 
+if TYPE_CHECKING:
+    from cyclopts import App
+
+ABOUT = "Adapt feed-forward 3D models to your scene at test time."
+GLOBAL = "Every command takes --config FILE.toml (a table of options per command) and -v for more messages."
 USER_MISTAKE, FAILURE, INTERRUPTED = 2, 1, 130
 
 COMMANDS = {
@@ -20,18 +34,30 @@ COMMANDS = {
     "run": ("freegeo.cli.run:run", "Photos in, adapted reconstruction out."),
     "adapt": ("freegeo.cli.adapt:adapt", "Adapt a model to one or several scenes and save the adapter."),
     "reconstruct": ("freegeo.cli.reconstruct:reconstruct", "Reconstruct with a frozen model or a saved adapter."),
+    "export": ("freegeo.cli.export:export", "Write a reconstruction as ply, glb, mesh, colmap, nerfstudio, depth."),
+    "bench": ("freegeo.cli.bench:app", "Published evaluation: datasets, tables, comparison with the paper."),
     "models": ("freegeo.cli.models:app", "List, describe, download and check models."),
     "train-tiny": ("freegeo.cli.train_tiny:train_tiny", "Train the embedded model on generated rooms."),
 }
 
 
+def overview() -> str:
+    """Return the help of the program itself: a table of the commands."""
+    width = max(len(name) for name in COMMANDS)
+    rows = [f"  {name.ljust(width)}  {about}" for name, (_, about) in COMMANDS.items()]
+    options = ["  --help, -h  Show this, or the help of a command.", "  --version   Show the version."]
+    return "\n".join(["Usage: freegeo COMMAND ...", "", ABOUT, "", "Commands:", *rows, "", *options, "", GLOBAL])
+
+
 def build(config: Path | None = None) -> App:
     """Build the command tree; `config` is a TOML file with one table per command."""
-    app = App(
+    import cyclopts
+
+    app = cyclopts.App(
         name="freegeo",
-        help="Adapt feed-forward 3D models to your scene at test time.",
+        help=ABOUT,
         version=__version__,
-        help_epilogue="Every command takes --config FILE.toml (one table per command) and -v for more messages.",
+        help_epilogue=GLOBAL,
         config=None if config is None else cyclopts.config.Toml(config, must_exist=True),
         help_format="plaintext",
         result_action="return_value",
@@ -43,15 +69,27 @@ def build(config: Path | None = None) -> App:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command line; returns the exit code (0, 2 for the user's mistake, 1 for a failure)."""
+    """Run a command line; returns the exit code (0, 2 for the user's mistake, 1 for a failure, 130 for Ctrl-C)."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    from freegeo.cli import console
+    # The parser takes longer to load than these two take to answer.
+    if arguments in ([], ["-h"], ["--help"]):
+        console.say(overview())
+        return 0
+    if arguments == ["--version"]:
+        console.say(__version__)
+        return 0
+    return run_command(arguments)
 
+
+def run_command(arguments: Sequence[str]) -> int:
+    """Parse and run a command, and turn its errors into one sentence and an exit code."""
+    import cyclopts
+
+    console.remember_command(arguments)
     try:
-        arguments, config, verbose = split_global(arguments)
+        rest, config, verbose = split_global(arguments)
         console.configure_logging(verbose)
-        app = build(config)
-        app(arguments, exit_on_error=False, print_error=False)
+        build(config)(rest, exit_on_error=False, print_error=False)
     except cyclopts.CycloptsError as error:
         return console.fail(one_line(str(error)), USER_MISTAKE)
     except UserError as error:
@@ -61,11 +99,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return console.fail("interrupted; the same command continues an unfinished run.", INTERRUPTED)
     except OSError as error:
-        return console.fail(f"{error.filename or 'output'}: {error.strerror or error}.", FAILURE)
+        return console.fail(f"{error.filename or 'input or output'}: {error.strerror or error}.", FAILURE)
     return 0
 
 
-def split_global(arguments: list[str]) -> tuple[list[str], Path | None, bool]:
+def split_global(arguments: Sequence[str]) -> tuple[list[str], Path | None, bool]:
     """Take --config FILE and -v/--verbose off a command line; they may stand anywhere."""
     rest, config, verbose = [], None, False
     tokens = iter(arguments)
@@ -74,12 +112,34 @@ def split_global(arguments: list[str]) -> tuple[list[str], Path | None, bool]:
             verbose = True
         elif token == "--config" or token.startswith("--config="):
             value = token.partition("=")[2] or next(tokens, "")
-            config = Path(value)
-            if not config.is_file():
-                raise UserError(f"--config {value or '(nothing)'}: no such file.")
+            if not value:
+                raise UserError("--config needs the name of a TOML file.")
+            config = checked_config(Path(value))
         else:
             rest.append(token)
     return rest, config, verbose
+
+
+def checked_config(path: Path) -> Path:
+    """Return the path of a config file; UserError unless it is TOML with tables named like commands.
+
+    The parser refuses unknown options of the command that runs, but not tables that no command reads.
+    """
+    try:
+        with path.open("rb") as file:
+            content = tomllib.load(file)
+    except OSError as error:
+        raise UserError(f"--config {path}: {error.strerror}. Check the name.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"--config {path}: not a TOML file ({error}).") from None
+    for name, table in content.items():
+        if name not in COMMANDS or not isinstance(table, dict):
+            tables = ", ".join(f"[{command}]" for command in COMMANDS)
+            raise UserError(f"--config {path}: '{name}' is no table of a command. Put options into one of {tables}.")
+        for option in table:
+            if option.startswith(("no-", "no_")):
+                raise UserError(f"--config {path}: write {option[3:]} = false instead of {option} in [{name}].")
+    return path
 
 
 def one_line(text: str) -> str:

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import sys
+import textwrap
+import warnings
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+_typed: list[str] = []
+
 
 def configure_logging(verbose: bool) -> None:
-    """Send the library's messages to stderr: notes by default, everything with -v."""
+    """Send the library's messages to stderr: notes by default, everything with -v; warnings as one line each."""
     logger = logging.getLogger("freegeo")
     logger.handlers.clear()
     handler = logging.StreamHandler()
@@ -19,6 +24,27 @@ def configure_logging(verbose: bool) -> None:
     logger.addHandler(handler)
     logger.setLevel(logging.DEBUG if verbose else logging.INFO)
     logger.propagate = False
+    warnings.showwarning = _show_warning  # ty: ignore[invalid-assignment]
+    if not verbose:
+        # Pillow warns of odd metadata in files that it reads all the same.
+        warnings.filterwarnings("ignore", category=UserWarning, module="PIL")
+
+
+def _show_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, file=None, line: str | None = None
+) -> None:
+    """Stand in for Python's own, which shows a line of source code to people who asked for none."""
+    note(f"warning: {message}")
+
+
+def remember_command(arguments: Sequence[str]) -> None:
+    """Keep the command line, for files that say how they were made."""
+    _typed[:] = ["freegeo", *arguments]
+
+
+def command_line() -> str:
+    """Return the command line as it could be typed."""
+    return shlex.join(_typed)
 
 
 def say(text: str = "") -> None:
@@ -78,13 +104,29 @@ def _lines(title: str, total: int):
     return update
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Lay out a plain table: first column to the left, the others to the right."""
+def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, prose: int = 0) -> str:
+    """Lay out a plain table: first column to the left, the others to the right.
+
+    `prose` > 0: the last column is text, to the left and wrapped, so that lines have at most `prose` characters.
+    """
     cells = [list(header), *(list(row) for row in rows)]
+    if prose:
+        room = prose - sum(max(len(row[k]) for row in cells) + 2 for k in range(len(header) - 1))
+        cells = [line for row in cells for line in _wrapped(row, room)]
     widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
-    lines = ["  ".join(c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True)))
-             for row in cells]  # fmt: skip
-    return "\n".join([lines[0], "  ".join("-" * w for w in widths), *lines[1:]])
+    left = {0, len(header) - 1} if prose else {0}
+    lines = [
+        "  ".join(c.ljust(w) if k in left else c.rjust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True)))
+        for row in [*cells[:1], ["-" * w for w in widths], *cells[1:]]
+    ]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _wrapped(row: list[str], room: int) -> list[list[str]]:
+    """Spread a row over as many lines as its last cell needs."""
+    parts = textwrap.wrap(row[-1], room) or [""]
+    blank = [""] * (len(row) - 1)
+    return [[*(row[:-1] if k == 0 else blank), part] for k, part in enumerate(parts)]
 
 
 def written(folder: Path, files: Mapping[str, str]) -> None:

@@ -10,17 +10,16 @@ from cyclopts import Parameter
 
 from freegeo.cli import console
 from freegeo.cli.jobs import run_job
-from freegeo.cli.options import ModelOptions, OutputOptions, RecipeOptions
+from freegeo.cli.options import DemoModelOptions, OutputOptions, RecipeOptions
 from freegeo.cli.sources import DEMO_DOMAIN, demo_scene
-from freegeo.models.catalog import EMBEDDED_MODEL
-from freegeo.storage import write_json
+from freegeo.storage import read_json, write_json
 
 if TYPE_CHECKING:
     from freegeo.data.scene import Scene
     from freegeo.pipeline import Job
 
-DEFAULT_RECIPE = RecipeOptions()
-DEFAULT_MODEL = ModelOptions(model=EMBEDDED_MODEL)
+SCORES_NAME = "scores.json"
+DEFAULT_RECIPE, DEFAULT_MODEL = RecipeOptions(), DemoModelOptions()
 EVERY = 8
 VIEWS = (4, 8)
 WINDOW_STEP = 2
@@ -33,7 +32,7 @@ def demo(
     overwrite: bool = False,
     room: int = 0,
     domain: str = DEMO_DOMAIN,
-    model: ModelOptions = DEFAULT_MODEL,
+    model: DemoModelOptions = DEFAULT_MODEL,
     recipe: RecipeOptions = DEFAULT_RECIPE,
 ) -> None:
     """Show the whole line on a generated room, against exact ground truth. Works offline on a CPU.
@@ -54,13 +53,15 @@ def demo(
     plan = recipe.build(loaded.spec)
     extra = {"room": room, "domain": domain}
     target = OutputOptions(output=output, overwrite=overwrite)
-    job = run_job(scene.photos, loaded, model, target, command="demo", recipe=plan, extra_settings=extra)
-    if job is None:
-        return
-    save_photos(scene, output / "photos")
-    scores = score_windows(job, scene)
-    write_json(output / "scores.json", scores)
-    report(scores, domain)
+
+    def add_scores(job: Job) -> None:
+        save_photos(scene, output / "photos")
+        write_json(output / SCORES_NAME, score_windows(job, scene))
+
+    run_job(
+        scene.photos, loaded, model, target, command="demo", recipe=plan, extra_settings=extra, after=add_scores
+    )  # fmt: skip
+    report(read_json(output / SCORES_NAME), domain)
 
 
 def save_photos(scene: Scene, folder: Path) -> None:

@@ -10,6 +10,7 @@ from freegeo.cli import console
 from freegeo.models import catalog
 
 app = App(name="models", help="List, describe, download and check models.", help_format="plaintext")
+TABLE_WIDTH = 100
 RANKS = (8, 16, 32, 64)
 
 
@@ -17,14 +18,16 @@ RANKS = (8, 16, 32, 64)
 def list_models() -> None:
     """List all models."""
     rows = [_row(name) for name in catalog.names()]
-    console.say(console.table(("model", "parameters", "licence of the weights", "about"), rows))
+    console.say(console.table(("model", "parameters", "licence", "about"), rows, prose=TABLE_WIDTH))
+    console.say("\nLicences are those of the weights. `freegeo models describe NAME` says more about one model.")
 
 
 def _row(name: str) -> tuple[str, str, str, str]:
     item = catalog.entry(name)
-    about = item.about if item.build else f"not implemented yet: {item.about}"
+    # Details follow after a bracket in licences and after a semicolon in descriptions.
+    licence, about = item.licence.partition(" (")[0], item.about.partition(";")[0]
     parameters = item.parameters or parameter_count(name)
-    return name, f"{parameters / 1e6:,.1f} M", item.licence, about
+    return name, f"{parameters / 1e6:,.1f} M", licence, about if item.build else f"not implemented yet: {about}"
 
 
 def parameter_count(name: str) -> int:

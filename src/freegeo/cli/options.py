@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from freegeo.models.catalog import DEFAULT_MODEL
+from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL
 
 SMALL_MODEL = 20_000_000
 """Parameters below which a model runs on one CPU thread."""
@@ -34,6 +34,8 @@ class ModelOptions:
     """Arithmetic of the transformer; default: bf16 on CUDA, else fp32."""
     seed: int = 43
     """Seed of everything random."""
+    reference: str | None = None
+    """Reference view of the frozen model: first, middle, saddle_balanced, saddle_sim_range; default: the model's."""
 
     def load(self) -> ReconstructionModel:
         """Load the model."""
@@ -59,7 +61,17 @@ class ModelOptions:
             "checkpoint": loaded.fingerprint if loaded else None,
             "precision": self.engine().precision,
             "seed": self.seed,
+            "reference": self.reference or model.spec.reference,
         }
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class DemoModelOptions(ModelOptions):
+    """A class of its own, since the parser takes the defaults of options that are left out from the class."""
+
+    model: str = EMBEDDED_MODEL
+    """Catalog name (`freegeo models`) or a plug-in's."""
 
 
 def use_few_threads(model: ReconstructionModel) -> None:

@@ -21,11 +21,19 @@ def load_source(sources: Sequence[str], max_views: int) -> list[PhotoLike]:
     """Return the photos of one scene: several files are one scene, in the order given."""
     from freegeo.data.photos import load_photos
 
-    if not sources:
-        raise UserError("no source given: name a folder of photos, a glob, or photo files.")
+    require_sources(sources)
     if list(sources) == [DEMO]:
         return list(demo_scene(0, DEMO_DOMAIN).photos)[:max_views]
     return list(load_photos(sources[0] if len(sources) == 1 else list(sources), max_views))
+
+
+def require_sources(sources: Sequence[str]) -> None:
+    """Raise UserError when a command line names no source, or one twice."""
+    if not any(sources):
+        raise UserError("no source given: name a folder of photos, a glob in quotes, photo files, or `demo`.")
+    if len(set(sources)) < len(sources):
+        twice = next(source for source in sources if sources.count(source) > 1)
+        raise UserError(f"{twice} is given twice. Name each source once.")
 
 
 def demo_scene(room: int, domain: str) -> Scene:
@@ -38,6 +46,7 @@ def demo_scene(room: int, domain: str) -> Scene:
 
 def split_scenes(sources: Sequence[str]) -> list[list[str]]:
     """Tell scenes apart: photo files together are one scene, every folder or pattern is one of its own."""
+    require_sources(sources)
     if all(Path(source).is_file() for source in sources):
         return [list(sources)]
     return [[source] for source in sources]

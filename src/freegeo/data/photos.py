@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import logging
 import re
+import warnings
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ MAX_PIXELS = 150_000_000
 """Largest photo that is read; beyond it a decoded photo takes more than half a gigabyte."""
 MAX_VIEWS = 32
 _SYSTEM_FILES = frozenset({"thumbs.db", "desktop.ini"})
-_ORIENTATION_TAG = 0x0112
+_ORIENTATION_TAG, _SIDEWAYS = 0x0112, (5, 6, 7, 8)
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def find_photos(source: str | Path | Sequence[str | Path]) -> list[Path]:
 
 def natural_key(path: Path) -> list[tuple[int, int | str]]:
     """Sort key that puts frame2 before frame10."""
-    return [(0, int(part)) if part.isdigit() else (1, part.lower()) for part in re.split(r"(\d+)", str(path)) if part]
+    return [(0, int(part)) if part.isdecimal() else (1, part.lower()) for part in re.split(r"(\d+)", str(path)) if part]
 
 
 def unique_names(paths: Sequence[Path]) -> list[str]:
@@ -118,11 +119,34 @@ def _photo_suffix(files: Sequence[Path]) -> str:
 
 
 def _checked_file(path: Path) -> Path:
+    if path.is_dir():
+        raise UserError(f"{path}: a folder among several sources. Give one folder alone, or a list of photo files.")
     if not path.is_file():
-        raise UserError(f"{path}: no such file.")
+        raise UserError(f"{path}: no such file. Check the name.")
     if path.suffix.lower() not in PHOTO_SUFFIXES | HEIF_SUFFIXES:
         raise UserError(f"{path}: not a photo. Supported are {_supported()}.")
     return path
+
+
+def load_masks(folder: Path, names: Sequence[str]) -> list[np.ndarray]:
+    """Read one mask (H, W) uint8 for each photo name from a folder, by the name without its ending.
+
+    UserError when the folder or a mask is missing or unreadable.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such folder of masks.")
+    files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in PHOTO_SUFFIXES}
+    missing = [name for name in names if Path(name).stem not in files]
+    if missing:
+        raise UserError(
+            f"{folder}: {len(missing)} of {len(names)} photos have no mask (first: {missing[0]}). Name each mask as its "
+            "photo, or leave --masks out."
+        )
+    masks = []
+    for name in names:
+        with _opened(files[Path(name).stem]) as image:
+            masks.append(np.array(image.convert("L")))
+    return masks
 
 
 @contextmanager
@@ -132,19 +156,29 @@ def _opened(path: Path) -> Generator:
     if path.suffix.lower() in HEIF_SUFFIXES:
         _register_heif(path)
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings():
+            # Pillow warns, and at twice the size refuses, by a limit of its own; ours decides.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            image = Image.open(path)
+        with image:
             if image.width * image.height > MAX_PIXELS:
-                raise UserError(
-                    f"{path}: {image.width} x {image.height} pixels are more than the limit of "
-                    f"{MAX_PIXELS // 1_000_000} megapixels. Shrink the photo first."
-                )
+                raise _too_large(path, f"{image.width} x {image.height} pixels are")
             yield image
+    except UserError:
+        raise
     except UnidentifiedImageError:
         raise UserError(f"{path}: the file is not a readable image. Replace it or take it out.") from None
-    except Image.DecompressionBombError as error:
-        raise UserError(f"{path}: {error} Shrink the photo first.") from None
-    except (OSError, SyntaxError) as error:
-        raise UserError(f"{path}: the image is damaged or truncated ({error}). Replace it or take it out.") from None
+    except Image.DecompressionBombError:
+        raise _too_large(path, "its pixels are") from None
+    except (OSError, SyntaxError, EOFError, ValueError, RuntimeError) as error:
+        # Every decoder of Pillow and of its plug-ins reports damage in a way of its own.
+        reason = " ".join(str(error).split())
+        raise UserError(f"{path}: the image is damaged or truncated ({reason}). Replace it or take it out.") from None
+
+
+def _too_large(path: Path, what: str) -> UserError:
+    limit = MAX_PIXELS // 1_000_000
+    return UserError(f"{path}: {what} more than the limit of {limit} megapixels. Shrink the photo first.")
 
 
 def _register_heif(path: Path) -> None:
@@ -157,7 +191,8 @@ def _register_heif(path: Path) -> None:
 
 def _size_hw(path: Path) -> tuple[int, int]:
     with _opened(path) as image:
-        turned = image.getexif().get(_ORIENTATION_TAG, 1) >= 5
+        # Pillow gives the size of a TIFF as it is after rotation, of everything else as it is stored.
+        turned = image.format != "TIFF" and image.getexif().get(_ORIENTATION_TAG) in _SIDEWAYS
         return (image.width, image.height) if turned else (image.height, image.width)
 
 

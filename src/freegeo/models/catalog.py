@@ -19,6 +19,7 @@ logger = logging.getLogger(__name__)
 DEFAULT_MODEL = "da3-base"
 EMBEDDED_MODEL = "freegeo-tiny"
 PLUGIN_GROUP = "freegeo.models"
+REACHABLE_WITHIN_S = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,17 +60,21 @@ class LoadedFrom:
 
 def names() -> list[str]:
     """Return all model names: our own, then those of installed plug-ins."""
-    return list(_own_entries()) + sorted(_plugin_points())
+    own = list(_own_entries())
+    return own + sorted(set(_plugin_points()) - set(own))
 
 
 def entry(name: str) -> ModelEntry:
-    """Look a model up; UserError lists the names that exist."""
+    """Look a model up, ours before a plug-in's; UserError lists the names that exist."""
     own = _own_entries()
     if name in own:
         return own[name]
     points = _plugin_points()
     if name in points:
-        return points[name].load()
+        item = points[name].load()
+        if not isinstance(item, ModelEntry):
+            raise FreeGeoError(f"the plug-in '{name}' ({points[name].value}) is no ModelEntry. Tell its author.")
+        return item
     raise UserError(f"unknown model '{name}'. Known are {', '.join(names())}.")
 
 
@@ -109,18 +114,45 @@ def download(name: str) -> Path:
         return item.packaged_weights
     if item.hub_id is None:
         raise UserError(f"{name} has no download; give its weights with --checkpoint.")
-    from huggingface_hub import hf_hub_download
+    import huggingface_hub
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError
 
+    cached = huggingface_hub.try_to_load_from_cache(item.hub_id, item.hub_file)
+    if isinstance(cached, str):
+        return Path(cached)
     try:
-        return Path(hf_hub_download(item.hub_id, item.hub_file))
-    except (LocalEntryNotFoundError, HfHubHTTPError, OSError) as error:
+        _require_reachable(huggingface_hub.hf_hub_url(item.hub_id, item.hub_file))
+        return Path(huggingface_hub.hf_hub_download(item.hub_id, item.hub_file))
+    except (LocalEntryNotFoundError, HfHubHTTPError, OSError, _http_error()) as error:
         logger.debug("download of %s failed: %s", item.hub_id, error)
         raise UserError(
             f"the checkpoint of {name} ({item.hub_id}, {item.download_gb:.1f} GB) is not on this machine and could not "
             f"be downloaded. {_how_to_download(item)}, pass --checkpoint FILE, or use the embedded model: "
             f"--model {EMBEDDED_MODEL}."
         ) from None
+
+
+def _require_reachable(url: str) -> None:
+    """Ask for a file's header once, without the hub library's retries, which take half a minute when offline."""
+    import huggingface_hub
+
+    hub_logger = logging.getLogger("huggingface_hub")
+    level = hub_logger.level
+    hub_logger.setLevel(logging.CRITICAL)
+    try:
+        huggingface_hub.get_hf_file_metadata(url, timeout=REACHABLE_WITHIN_S)
+    finally:
+        hub_logger.setLevel(level)
+
+
+def _http_error() -> type[Exception]:
+    """Return the base of the network errors of the hub library's client: httpx or httpx2, by its version."""
+    import importlib
+
+    import huggingface_hub
+
+    client = type(huggingface_hub.get_session()).__module__.partition(".")[0]
+    return importlib.import_module(client).HTTPError
 
 
 def _how_to_download(item: ModelEntry) -> str:

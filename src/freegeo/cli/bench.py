@@ -1,0 +1,380 @@
+"""`freegeo bench`: the published evaluation and every table of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from freegeo.cli import console
+from freegeo.errors import FreeGeoError, UserError
+
+if TYPE_CHECKING:
+    from freegeo.benchmark.experiments import Experiment
+    from freegeo.benchmark.predict import Predictor
+    from freegeo.benchmark.tasks import Problem, Task
+
+app = App(
+    name="bench", help="Published evaluation: datasets, tables, comparison with the paper.", help_format="plaintext"
+)
+
+DATA = Path("benchmark-data")
+PROBLEMS_FILE = "problems.json"
+TABLES = "tables"
+SHOWN_PROBLEMS = 20
+QUICK = {"rooms": 12, "seeds": (43,), "steps": 60}
+"""What --quick stands for: rooms of every split, frame seeds, optimiser steps of an adapter."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class BenchOptions:
+    """What a benchmark run is made of."""
+
+    output: Annotated[Path, Parameter(name=("--output", "-o"))] = Path("out/bench")
+    """Folder of predictions, adapters, results and tables."""
+    data: Path = DATA
+    """Folder of the unpacked datasets; generated rooms are rendered into it."""
+    datasets: str = "procedural"
+    """Separated by commas: eth3d, 7scenes, scannetpp, hiroom, procedural (its five splits), procedural-light, ..."""
+    scenes: int | None = None
+    """Only the first so many scenes of every dataset."""
+    views: str | None = None
+    """Only these numbers of views, such as 4,8."""
+    seeds: str | None = None
+    """Frame seeds instead of the experiment's, such as 43,44,45."""
+    frames: Literal["da3", "vggt", "experiment", "neighbours"] = "da3"
+    """Frame rule of the model family, where the experiment has none of its own (docs/benchmark.md)."""
+    quick: bool = False
+    """12 scenes of every dataset, seed 43, 60 steps of adaptation, unless given otherwise."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class BenchModel:
+    """Which model is scored, and how it is adapted."""
+
+    model: str = "freegeo-tiny"
+    """Catalog name (`freegeo models`) or a plug-in's."""
+    checkpoint: Path | None = None
+    """Local weight file or folder, instead of the download."""
+    device: str | None = None
+    """cpu, cuda, cuda:N or mps; default: the best at hand."""
+    precision: Literal["fp32", "bf16", "fp16"] | None = None
+    """Arithmetic of the transformer; default: bf16 on CUDA, else fp32."""
+    recipe: Literal["paper", "scene", "released-da3", "released-vggt"] = "paper"
+    """Named settings of adaptation."""
+    steps: int | None = None
+    """Optimiser steps instead of the recipe's length."""
+    epochs: int | None = None
+    """Passes over all view sets instead of the recipe's length."""
+    lr: float | None = None
+    """Peak learning rate."""
+    adapt_per: Literal["dataset", "scene"] = "dataset"
+    """One adapter for all scenes of a dataset, or one for each."""
+    adapt_seed: int = 42
+    """Seed of the adaptation."""
+    epoch: int | None = None
+    """Epoch whose adapter is used, counted from 0; default: the last."""
+
+
+DEFAULT_BENCH, DEFAULT_MODEL = BenchOptions(), BenchModel()
+
+
+@app.command(name="list")
+def list_experiments() -> None:
+    """List the experiments."""
+    from freegeo.benchmark.experiments import EXPERIMENTS
+
+    rows = [(entry.name, entry.title) for entry in EXPERIMENTS.values()]
+    width = max(len(name) for name, _ in rows)
+    for name, title in rows:
+        console.say(f"{name.ljust(width)}  {title}")
+
+
+@app.command
+def check(data: Path = DATA, *, datasets: str = "eth3d,7scenes,scannetpp,hiroom") -> None:
+    """Say what is missing in a data folder and how to get it.
+
+    Parameters
+    ----------
+    data
+        Folder of the unpacked datasets.
+    datasets
+        Datasets to look at, separated by commas.
+    """
+    from freegeo.benchmark.check import check_data
+
+    findings = check_data(data, _split(datasets))
+    for finding in findings:
+        console.say(f"{finding.dataset}: {finding.scenes} of {finding.wanted or '?'} scenes complete")
+        for problem in finding.problems[:SHOWN_PROBLEMS]:
+            console.say(f"  {problem}")
+        if len(finding.problems) > SHOWN_PROBLEMS:
+            console.say(f"  and {len(finding.problems) - SHOWN_PROBLEMS} more")
+        if not finding.complete:
+            console.say(f"  get it: {finding.how_to_get}")
+    incomplete = [finding.dataset for finding in findings if not finding.complete]
+    if incomplete:
+        raise FreeGeoError(f"{data}: incomplete for {', '.join(incomplete)}; the lines above say what is missing.")
+
+
+@app.command
+def predict(
+    *experiments: str,
+    bench: BenchOptions = DEFAULT_BENCH,
+    model: BenchModel = DEFAULT_MODEL,
+    overwrite: bool = False,
+    estimate_only: bool = False,
+    cluster: bool = False,
+) -> None:
+    """First stage: predict everything the experiments need; a stopped run continues.
+
+    Parameters
+    ----------
+    experiments
+        Names (`freegeo bench list`), or all.
+    overwrite
+        Replace predictions that were made with other settings.
+    estimate_only
+        Only say what it would cost.
+    cluster
+        Spread the tasks over a ray cluster (extra `cluster`).
+    """
+    predictor, tasks = _prepare(experiments, bench, model, overwrite)
+    problems = _predict(predictor, tasks, bench, estimate_only=estimate_only, cluster=cluster)
+    _require_none(problems, bench.output)
+
+
+@app.command
+def evaluate(
+    *experiments: str, bench: BenchOptions = DEFAULT_BENCH, device: str | None = None, figures: bool = False
+) -> None:
+    """Second stage: score the stored predictions of a folder and print the tables; needs no model.
+
+    Parameters
+    ----------
+    experiments
+        Names whose tables are printed; none: all that have results.
+    device
+        Where depth is fused.
+    figures
+        Draw the figures too.
+    """
+    problems = _evaluate(bench, device, wanted=None)
+    _tables(experiments or ("all",), bench)
+    if figures:
+        _figures(bench)
+    _require_none(problems, bench.output)
+
+
+@app.command
+def run(
+    *experiments: str,
+    bench: BenchOptions = DEFAULT_BENCH,
+    model: BenchModel = DEFAULT_MODEL,
+    overwrite: bool = False,
+    cluster: bool = False,
+    figures: bool = False,
+) -> None:
+    """Both stages: predict, evaluate, print the tables.
+
+    Parameters
+    ----------
+    experiments
+        Names (`freegeo bench list`), or all.
+    overwrite
+        Replace predictions that were made with other settings.
+    cluster
+        Spread the predictions over a ray cluster (extra `cluster`).
+    figures
+        Draw the figures too.
+    """
+    predictor, tasks = _prepare(experiments, bench, model, overwrite)
+    problems = _predict(predictor, tasks, bench, cluster=cluster)
+    failed = {(problem.dataset, problem.scene) for problem in problems}
+    # What could not be predicted is known already; it shall not be reported twice.
+    wanted = [task for task in tasks if (task.dataset, task.scene) not in failed]
+    problems += _evaluate(bench, model.device, wanted=wanted)
+    _tables(experiments, bench)
+    if figures:
+        _figures(bench)
+    _require_none(problems, bench.output)
+
+
+def _prepare(
+    experiments: Sequence[str], bench: BenchOptions, model: BenchModel, overwrite: bool
+) -> tuple[Predictor, list[Task]]:
+    """Return the predictor and the tasks of a run."""
+    from freegeo.benchmark.experiments import chosen, datasets_of
+    from freegeo.benchmark.predict import Predictor, Setup, listed_scenes
+    from freegeo.benchmark.tasks import unique
+    from freegeo.cli.options import use_few_threads
+
+    if not experiments:
+        raise UserError("name at least one experiment, or all; `freegeo bench list` lists them.")
+    entries = chosen(experiments)
+    names = _datasets(bench.datasets)
+    limit = bench.scenes or (QUICK["rooms"] if bench.quick else None)
+    seeds = _numbers(bench.seeds, "--seeds")
+    scenes = {name: listed_scenes(bench.data, name, limit) for name in names}
+    tasks = [
+        task
+        for entry in entries
+        for task in entry.tasks(
+            {name: scenes[name] for name in datasets_of(entry, names)}, rule=bench.frames,
+            seeds=seeds or (entry.seeds[:1] if bench.quick else None), views=_numbers(bench.views, "--views"),
+        )
+    ]  # fmt: skip
+    steps = model.steps or (QUICK["steps"] if bench.quick and model.epochs is None else None)
+    predictor = Predictor(
+        Setup(
+            data=bench.data, out=bench.output, model=model.model, checkpoint=model.checkpoint, device=model.device,
+            precision=model.precision, recipe=model.recipe,
+            changes={"steps": steps, "epochs": model.epochs, "lr": model.lr}, adapt_per=model.adapt_per,
+            adapt_seed=model.adapt_seed, epoch=model.epoch, scenes=scenes, overwrite=overwrite,
+        )
+    )  # fmt: skip
+    use_few_threads(predictor.model)
+    return predictor, unique(tasks)
+
+
+def _predict(
+    predictor: Predictor, tasks: list[Task], bench: BenchOptions, *, estimate_only: bool = False, cluster: bool = False
+) -> list[Problem]:
+    from freegeo.benchmark.cost import estimate
+    from freegeo.benchmark.predict import predict_all
+    from freegeo.storage import locked
+
+    waiting = predictor.unfinished(tasks)
+    console.say(f"{len(tasks)} tasks, {len(tasks) - len(waiting)} of them finished")
+    if not waiting:
+        return []
+    for line in estimate(predictor, waiting).lines():
+        console.say(f"  {line}")
+    if estimate_only:
+        return []
+    with locked(bench.output):
+        if cluster:
+            from freegeo.benchmark.cluster import predict_on_cluster
+
+            return predict_on_cluster(predictor, tasks)
+        with console.progress_bar("predicting", len(waiting)) as update:
+            done = 0
+
+            def on_task(task: Task) -> None:
+                nonlocal done
+                done += 1
+                update(done, str(task))
+
+            def on_step(job, progress) -> None:
+                if progress.step % 10 == 0 or progress.step + 1 == progress.steps:
+                    update(done, f"adapting to {job.dataset}, step {progress.step + 1} of {progress.steps}")
+
+            return predict_all(predictor, tasks, on_step=on_step, on_task=on_task)
+
+
+def _evaluate(bench: BenchOptions, device: str | None, *, wanted: list[Task] | None) -> list[Problem]:
+    from freegeo.benchmark.score import evaluate_all
+    from freegeo.benchmark.tasks import stored_tasks
+    from freegeo.models.precision import choose_device
+
+    total = len(wanted) if wanted is not None else len(stored_tasks(bench.output))
+    with console.progress_bar("scoring", max(total, 1)) as update:
+        done = 0
+
+        def on_task(task: Task) -> None:
+            nonlocal done
+            done += 1
+            update(done, str(task))
+
+        result = evaluate_all(bench.data, bench.output, wanted=wanted, device=choose_device(device), on_task=on_task)
+    console.say(f"{len(result.rows)} numbers: " + ", ".join(str(path) for path in result.files))
+    return result.problems
+
+
+def _tables(experiments: Sequence[str], bench: BenchOptions) -> None:
+    """Print the tables as text and write them in every format."""
+    from freegeo.benchmark.experiments import chosen
+    from freegeo.benchmark.results import read_results
+    from freegeo.benchmark.tables import FORMATS, as_text, experiment_tables
+    from freegeo.storage import atomic_path
+
+    rows = read_results(bench.output)
+    family = _family(rows[0].model) if rows else None
+    for entry in chosen(experiments):
+        tables = experiment_tables(entry, rows, rule=bench.frames, family=family)
+        if not _has_own(entry, tables):
+            continue
+        for table in tables:
+            console.say(f"\n{as_text(table)}")
+        for ending, layout in FORMATS.items():
+            with atomic_path(bench.output / TABLES / f"{entry.name}.{ending}") as part:
+                part.write_text("\n".join(layout(table) for table in tables), encoding="utf-8")
+    console.say(f"tables: {bench.output / TABLES}")
+
+
+def _has_own(entry: Experiment, tables: Sequence) -> bool:
+    return any("published" not in table.title for table in tables)
+
+
+def _family(model: str) -> str | None:
+    from freegeo.models.catalog import build_empty
+
+    return build_empty(model).spec.adaptation.published
+
+
+def _figures(bench: BenchOptions) -> None:
+    from freegeo.benchmark.figures import draw_all
+
+    for path in draw_all(bench.data, bench.output):
+        console.say(str(path))
+
+
+def _require_none(problems: Sequence[Problem], out: Path) -> None:
+    """List what failed and end with exit code 1 when anything did."""
+    from dataclasses import asdict
+
+    from freegeo.storage import write_json
+
+    if not problems:
+        (out / PROBLEMS_FILE).unlink(missing_ok=True)
+        return
+    for problem in problems[:SHOWN_PROBLEMS]:
+        console.note(str(problem))
+    if len(problems) > SHOWN_PROBLEMS:
+        console.note(f"and {len(problems) - SHOWN_PROBLEMS} more")
+    write_json(out / PROBLEMS_FILE, [asdict(problem) for problem in problems])
+    scenes = {(problem.dataset, problem.scene) for problem in problems}
+    raise FreeGeoError(
+        f"{len(problems)} parts of {len(scenes)} scenes could not be computed, the others were. "
+        f"{out / PROBLEMS_FILE} lists them."
+    )
+
+
+def _datasets(text: str) -> list[str]:
+    from freegeo.benchmark.experiments import ROOMS
+    from freegeo.benchmark.tasks import unique
+    from freegeo.data.datasets import DATASETS
+
+    names = unique([name for part in _split(text) for name in (ROOMS if part == "procedural" else (part,))])
+    unknown = [name for name in names if name not in DATASETS]
+    if unknown:
+        raise UserError(f"--datasets {unknown[0]}: known are procedural, {', '.join(DATASETS)}.")
+    return names
+
+
+def _split(text: str) -> list[str]:
+    return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def _numbers(text: str | None, option: str) -> list[int] | None:
+    if text is None:
+        return None
+    try:
+        return [int(part) for part in _split(text)]
+    except ValueError:
+        raise UserError(f"{option} '{text}' is no list of numbers. Write it as 4,8.") from None

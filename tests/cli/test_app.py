@@ -1,0 +1,209 @@
+"""The program itself: help, version, messages, config files, and the table of models."""
+
+import logging
+import tomllib
+
+import pytest
+
+from freegeo import __version__
+from freegeo.cli import app, console
+from freegeo.cli.app import COMMANDS, main
+from freegeo.models import catalog
+
+
+def test_help_names_every_command_and_fits_a_terminal(freegeo):
+    for arguments in ([], ["--help"], ["-h"]):
+        outcome = freegeo(*arguments)
+        assert outcome.code == 0
+        assert outcome.err == ""
+        for name, (_, about) in COMMANDS.items():
+            assert f"  {name}" in outcome.out
+            assert about in outcome.out
+        assert max(map(len, outcome.out.splitlines())) <= 100
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_command_explains_itself(freegeo, command):
+    outcome = freegeo(command, "--help")
+    assert outcome.code == 0
+    assert outcome.err == ""
+    assert f"freegeo {command}" in outcome.out
+    assert "--config" in outcome.out
+
+
+def test_version(freegeo):
+    assert freegeo("--version").out.strip() == __version__
+
+
+def test_verbose_shows_what_the_library_notes_down():
+    for verbose, level in ((False, logging.INFO), (True, logging.DEBUG)):
+        console.configure_logging(verbose)
+        assert logging.getLogger("freegeo").getEffectiveLevel() == level
+        assert len(logging.getLogger("freegeo").handlers) == 1
+
+
+@pytest.mark.parametrize("flag", ["-v", "--verbose"])
+def test_verbose_may_stand_anywhere(flag):
+    for arguments in ([flag, "run", "x"], ["run", flag, "x"], ["run", "x", flag]):
+        assert app.split_global(arguments) == (["run", "x"], None, True)
+
+
+def test_command_line_is_quoted_as_it_could_be_typed():
+    console.remember_command(["run", "my photos/*.jpg", "-o", "out"])
+    assert console.command_line() == "freegeo run 'my photos/*.jpg' -o out"
+
+
+def test_interrupt_has_a_code_of_its_own(freegeo, monkeypatch, tmp_path):
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("freegeo.cli.reconstruct.load_source", interrupt)
+    outcome = freegeo("reconstruct", "x", "-o", tmp_path / "out")
+    assert outcome.code == 130
+    assert "interrupted" in outcome.sentence()
+
+
+# -- config files
+
+
+@pytest.fixture
+def caught(monkeypatch) -> list:
+    """What `run` would have done."""
+    calls = []
+    monkeypatch.setattr("freegeo.cli.run.load_source", lambda sources, limit: calls.append((sources, limit)))
+    monkeypatch.setattr("freegeo.cli.options.ModelOptions.load", lambda self: type("Model", (), {"spec": None}))
+    monkeypatch.setattr("freegeo.cli.options.RecipeOptions.build", lambda self, spec: self)
+    monkeypatch.setattr("freegeo.cli.run.run_job", lambda *args, **options: calls.append((args, options)))
+    return calls
+
+
+def config(folder, text: str) -> str:
+    file = folder / "freegeo.toml"
+    file.write_text(text)
+    return str(file)
+
+
+def test_config_sets_options_and_the_command_line_wins(caught, tmp_path):
+    file = config(tmp_path, '[run]\nmodel = "da3-large"\nsteps = 5\nmax-views = 7\nrank = 4\n[adapt]\nsteps = 9\n')
+    assert main(["run", "x", "-o", "out", "--config", file, "--rank", "8"]) == 0
+    (sources, limit), ((_, _, model, output), options) = caught
+    assert (sources, limit) == (("x",), 7)
+    assert model.model == "da3-large"
+    assert str(output.output) == "out"
+    assert (options["recipe"].steps, options["recipe"].rank) == (5, 8)
+
+
+@pytest.mark.parametrize("spelling", ["--config FILE", "--config=FILE"])
+def test_config_sets_switches(caught, tmp_path, spelling):
+    file = config(tmp_path, '[run]\nadapt = false\noverwrite = true\noutput = "from-file"\n')
+    assert main(["run", "x", *spelling.replace("FILE", file).split()]) == 0
+    (_, _, _, output), options = caught[1]
+    assert options["recipe"] is None
+    assert output.overwrite
+    assert str(output.output) == "from-file"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[run]\nstepz = 2\n", "stepz"),
+        ('[run]\nsteps = "many"\n', 'unable to convert "many" into int'),
+        ("[rnu]\nsteps = 2\n", "'rnu' is no table of a command"),
+        ("steps = 2\n", "'steps' is no table of a command"),
+        ("[run]\nno-adapt = true\n", "write adapt = false instead of no-adapt in [run]"),
+        ("[run\n", "not a TOML file"),
+    ],
+)
+def test_mistakes_in_a_config_are_refused(freegeo, caught, tmp_path, text, words):
+    outcome = freegeo("run", "x", "-o", tmp_path / "out", "--config", config(tmp_path, text))
+    assert outcome.code == 2
+    assert words in outcome.sentence()
+    assert "freegeo.toml" in outcome.sentence()
+    assert caught == []
+
+
+def test_config_that_is_not_there(freegeo, tmp_path):
+    assert "No such file" in freegeo("run", "x", "-o", "out", "--config", tmp_path / "no.toml").sentence()
+    assert "needs the name" in freegeo("run", "x", "-o", "out", "--config").sentence()
+    assert "Is a directory" in freegeo("run", "x", "-o", "out", "--config", tmp_path).sentence()
+
+
+def test_example_in_the_documentation_is_a_config(caught, tmp_path):
+    lines = [line.strip() for line in (app.__doc__ or "").splitlines() if line.startswith("    ")]
+    text = "\n".join(lines)
+    assert set(tomllib.loads(text)) == {"run"}
+    assert main(["run", "x", "-o", "out", "--config", config(tmp_path, text)]) == 0
+
+
+def test_config_works_for_a_whole_run(freegeo, photo_folder, tiny, tmp_path):
+    file = config(
+        tmp_path, f'[reconstruct]\nmodel = "{tiny[1]}"\ncheckpoint = "{tiny[3]}"\noutput = "{tmp_path / "out"}"\n'
+    )
+    assert freegeo("reconstruct", photo_folder, "--config", file).code == 0
+    assert (tmp_path / "out" / "prediction.npz").is_file()
+
+
+# -- models
+
+
+def test_models_fit_a_terminal_and_name_every_licence(freegeo):
+    outcome = freegeo("models")
+    assert outcome.code == 0
+    lines = outcome.out.splitlines()
+    assert max(map(len, lines)) <= 100
+    for name in catalog.names():
+        (line,) = [line for line in lines if line.split()[:1] == [name]]
+        assert catalog.entry(name).licence.split(" (")[0] in line
+    assert "not implemented yet" in outcome.out
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [("da3-giant", ("5,311,488", "10,619,904", "21,236,736", "42,470,400")), ("freegeo-tiny", ("embedded",))],
+)
+def test_describe_counts_what_an_adapter_trains(freegeo, name, counts):
+    outcome = freegeo("models", "describe", name)
+    assert outcome.code == 0
+    assert outcome.out.startswith(f"{name}: ")
+    assert f"licence of the weights: {catalog.entry(name).licence}" in outcome.out
+    for count in counts:
+        assert count in outcome.out
+
+
+def test_describe_says_what_is_not_there_yet(freegeo):
+    for name in catalog.names():
+        if catalog.entry(name).build is None:
+            outcome = freegeo("models", "describe", name)
+            assert outcome.code == 0
+            assert "not implemented yet" in outcome.out
+            assert freegeo("models", "check", name, "x.safetensors").code == 2
+
+
+def test_check_tells_whether_a_file_fits(freegeo, weights):
+    assert "fits freegeo-tiny" in freegeo("models", "check", "freegeo-tiny", weights).out
+    outcome = freegeo("models", "check", "da3-small", weights)
+    assert outcome.code == 2
+    assert "does not fit da3-small" in outcome.sentence()
+    assert freegeo("models", "describe", "nothing").code == 2
+
+
+def test_embedded_model_needs_no_download(freegeo):
+    outcome = freegeo("models", "download", "freegeo-tiny")
+    assert outcome.code == 0
+    assert "freegeo-tiny.safetensors" in outcome.out
+
+
+def test_table_wraps_its_last_column():
+    text = console.table(("a", "b"), [("x", "one two three four five")], prose=20)
+    assert text.splitlines() == ["a  b", "-  -------------", "x  one two three", "   four five"]
+    plain = console.table(("name", "n"), [("x", "1"), ("long", "22")])
+    assert plain.splitlines() == ["name   n", "----  --", "x      1", "long  22"]
+
+
+def test_progress_without_a_terminal_is_a_line_per_tenth(capsys):
+    with console.progress_bar("steps", 40) as update:
+        for k in range(40):
+            update(k + 1, f"loss {k}")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 11
+    assert lines[-1].startswith("steps: 40/40, 0 s left")

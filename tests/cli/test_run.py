@@ -1,0 +1,287 @@
+"""`run`, `adapt` and `reconstruct`: what they write, that they continue, and that they leave results alone."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from safetensors.numpy import load_file
+
+from cli.conftest import PHOTOS, QUICK
+from freegeo.adaptation import trainer
+from freegeo.adaptation.trainer import STATE_FILE
+from freegeo.export import formats
+from freegeo.storage import LEDGER_FILE, LOCK_FILE
+from freegeo.storage import STATE_FILE as RUN_FILE
+
+ADAPTER_FILES = {"adapter_config.json", "adapter_model.safetensors", "camera_token.safetensors", "freegeo.json"}
+RESULT_FILES = {"reconstruction.json", "prediction.npz", "points.ply", "scene.glb"}
+ARRAYS = {
+    "depth_z": (PHOTOS, 48, 64),
+    "conf": (PHOTOS, 48, 64),
+    "images": (PHOTOS, 48, 64, 3),
+    "T_cam_world": (PHOTOS, 4, 4),
+    "K": (PHOTOS, 3, 3),
+    "names": (PHOTOS,),
+    "photo_hw": (PHOTOS, 2),
+    "scale_xy": (PHOTOS, 2),
+    "offset_xy": (PHOTOS, 2),
+    "format": (),
+}
+
+
+def files(folder: Path) -> set[str]:
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} - {RUN_FILE, LEDGER_FILE}
+
+
+def prediction(folder: Path) -> dict[str, np.ndarray]:
+    with np.load(folder / "prediction.npz", allow_pickle=False) as content:
+        return dict(content)
+
+
+def same(one: dict[str, np.ndarray], two: dict[str, np.ndarray]) -> bool:
+    return set(one) == set(two) and all(np.array_equal(one[name], two[name]) for name in one)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, photo_folder, tiny) -> Path:
+    """The result of one uninterrupted `run`."""
+    from freegeo.cli.app import main
+
+    out = tmp_path_factory.mktemp("finished") / "out"
+    assert main(["run", str(photo_folder), "-o", str(out), *tiny, *QUICK]) == 0
+    return out
+
+
+# -- run
+
+
+def test_run_writes_what_the_design_says(finished):
+    expected = RESULT_FILES | {"frozen/prediction.npz"} | {f"adapter/{name}" for name in ADAPTER_FILES}
+    assert files(finished) - {"report.html"} == expected
+    assert not (finished / LOCK_FILE).exists()
+
+
+def test_predictions_hold_all_arrays_and_the_way_back_to_the_photos(finished):
+    for folder in (finished, finished / "frozen"):
+        arrays = prediction(folder)
+        assert {name: value.shape for name, value in arrays.items() if name != "sky"} == ARRAYS
+        assert (arrays["depth_z"] > 0).all()
+        assert arrays["images"].dtype == np.uint8
+        assert list(arrays["names"]) == [f"{k}.png" for k in range(PHOTOS)]
+        assert (arrays["photo_hw"] == (48, 64)).all()
+    assert not same(prediction(finished), prediction(finished / "frozen"))
+
+
+def test_three_dimensional_files_open_elsewhere(finished):
+    points = trimesh.load(finished / "points.ply")
+    assert len(points.vertices) > 0
+    assert points.colors.shape == (len(points.vertices), 4)
+    scene = trimesh.load(finished / "scene.glb")
+    assert len(scene.geometry) >= 2
+
+
+def test_summary_says_how_the_result_came_about(finished, weights):
+    summary = json.loads((finished / "reconstruction.json").read_text())
+    assert summary["format"] == 1
+    assert summary["model"] == "freegeo-tiny"
+    assert summary["checkpoint"]["file"] == weights.name
+    assert summary["licence_of_weights"] == "Apache-2.0"
+    assert summary["images"] == [f"{k}.png" for k in range(PHOTOS)]
+    assert summary["recipe"]["steps"] == 2
+    assert summary["recipe"]["name"] == "scene"
+    assert summary["adapter"] == "adapter"
+    assert summary["command"].startswith("freegeo run ")
+    assert set(summary["versions"]) >= {"freegeo", "torch", "python"}
+    assert all(seconds >= 0 for seconds in summary["seconds"].values())
+    page = json.loads((finished / "adapter" / "freegeo.json").read_text())
+    assert page["base"]["model"] == "freegeo-tiny"
+    assert page["base"]["fingerprint"] == summary["checkpoint"]["fingerprint"]
+    assert [set(step) >= {"total"} for step in page["loss_curve"]] == [True, True]
+    assert load_file(finished / "adapter" / "camera_token.safetensors")
+
+
+def test_same_command_again_is_finished(freegeo, finished, photo_folder, tiny):
+    before = (finished / "prediction.npz").stat().st_mtime_ns
+    outcome = freegeo("run", photo_folder, "-o", finished, *tiny, *QUICK)
+    assert outcome.code == 0
+    assert "already finished on 20" in outcome.out
+    assert (finished / "prediction.npz").stat().st_mtime_ns == before
+
+
+def test_other_options_ask_for_overwrite(freegeo, finished, photo_folder, tiny):
+    before = files(finished)
+    outcome = freegeo("run", photo_folder, "-o", finished, *tiny, *QUICK, "--seed", 7)
+    assert outcome.code == 2
+    assert "seed: 43 there, 7 now" in outcome.sentence()
+    assert "--overwrite" in outcome.sentence()
+    assert files(finished) == before
+
+
+def test_other_photos_of_the_same_names_are_other_options(freegeo, finished, photo_folder, tiny, tmp_path):
+    from PIL import Image
+
+    for path in photo_folder.iterdir():
+        Image.open(path).transpose(Image.Transpose.FLIP_LEFT_RIGHT).save(tmp_path / path.name)
+    outcome = freegeo("run", tmp_path, "-o", finished, *tiny, *QUICK)
+    assert outcome.code == 2
+    assert "photo_contents" in outcome.sentence()
+
+
+def test_overwrite_replaces_the_result_and_spares_the_users_files(freegeo, photo_folder, tiny, tmp_path):
+    out = tmp_path / "out"
+    assert freegeo("run", photo_folder, "-o", out, *tiny, *QUICK).code == 0
+    (out / "notes.txt").write_text("mine")
+    outcome = freegeo("run", photo_folder, "-o", out, *tiny, "--no-adapt", "--overwrite")
+    assert outcome.code == 0, outcome.err
+    assert files(out) - {"report.html"} == RESULT_FILES | {"notes.txt"}
+
+
+def test_run_without_adapting_is_the_frozen_reconstruction(freegeo, finished, photo_folder, tiny, tmp_path):
+    assert freegeo("run", photo_folder, "-o", tmp_path / "a", *tiny, "--no-adapt").code == 0
+    assert freegeo("reconstruct", photo_folder, "-o", tmp_path / "b", *tiny).code == 0
+    for name in ("a", "b"):
+        assert files(tmp_path / name) - {"report.html"} == RESULT_FILES
+        assert same(prediction(tmp_path / name), prediction(finished / "frozen"))
+        summary = json.loads((tmp_path / name / "reconstruction.json").read_text())
+        assert summary["adapter"] is None
+        assert summary["recipe"] is None
+
+
+def test_output_lists_the_files_and_the_licence(freegeo, photo_folder, tiny, tmp_path):
+    outcome = freegeo("run", photo_folder, "-o", tmp_path / "out", *tiny, "--no-adapt")
+    for name in RESULT_FILES:
+        assert str(tmp_path / "out" / name) in outcome.out
+    assert "licence of the weights: Apache-2.0" in outcome.out
+    assert "Traceback" not in outcome.err
+
+
+def test_files_and_patterns_are_sources_too(freegeo, photo_folder, tiny, tmp_path):
+    listed = freegeo("reconstruct", photo_folder / "3.png", photo_folder / "0.png", "-o", tmp_path / "a", *tiny)
+    assert listed.code == 0
+    assert list(prediction(tmp_path / "a")["names"]) == ["3.png", "0.png"]
+    pattern = freegeo("reconstruct", f"{photo_folder}/*.png", "-o", tmp_path / "b", *tiny, "--max-views", 2)
+    assert pattern.code == 0
+    assert list(prediction(tmp_path / "b")["names"]) == ["0.png", "3.png"]
+
+
+def test_one_photo_is_enough_to_reconstruct(freegeo, photo_folder, tiny, tmp_path):
+    assert freegeo("reconstruct", photo_folder / "1.png", "-o", tmp_path / "out", *tiny).code == 0
+    assert prediction(tmp_path / "out")["depth_z"].shape == (1, 48, 64)
+
+
+# -- adapt, and reconstruct with its adapter
+
+
+def test_adapter_of_one_scene_gives_the_run_s_result(freegeo, finished, photo_folder, tiny, tmp_path):
+    adapter, out = tmp_path / "adapter", tmp_path / "out"
+    outcome = freegeo("adapt", photo_folder, "-o", adapter, *tiny, *QUICK)
+    assert outcome.code == 0, outcome.err
+    assert files(adapter) == ADAPTER_FILES
+    assert "already finished" in freegeo("adapt", photo_folder, "-o", adapter, *tiny, *QUICK).out
+    assert freegeo("adapt", photo_folder, "-o", adapter, *tiny, "--steps", 3).code == 2
+    assert freegeo("reconstruct", photo_folder, "-o", out, *tiny, "--adapter", adapter).code == 0
+    assert same(prediction(out), prediction(finished))
+    assert json.loads((out / "reconstruction.json").read_text())["adapter"] == str(adapter)
+
+
+def test_several_sources_make_one_adapter(freegeo, photo_folder, tiny, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    for k in range(3):
+        (other / f"{k}.png").write_bytes((photo_folder / f"{k + 1}.png").read_bytes())
+    adapter = tmp_path / "adapter"
+    assert freegeo("adapt", photo_folder, other, "-o", adapter, *tiny, "--epochs", 1, "--sets", 1).code == 0
+    page = json.loads((adapter / "freegeo.json").read_text())
+    assert page["scenes"] == [str(photo_folder), str(other)]
+    assert len(page["loss_curve"]) * page["recipe"]["batch"] >= 2
+    assert files(adapter) == ADAPTER_FILES | {f"epochs/epoch_0/{name}" for name in ADAPTER_FILES}
+
+
+def test_retrained_adapter_is_another_option(freegeo, photo_folder, tiny, tmp_path):
+    adapter, out = tmp_path / "adapter", tmp_path / "out"
+    assert freegeo("adapt", photo_folder, "-o", adapter, *tiny, *QUICK).code == 0
+    assert freegeo("reconstruct", photo_folder, "-o", out, *tiny, "--adapter", adapter).code == 0
+    assert freegeo("adapt", photo_folder, "-o", adapter, *tiny, *QUICK, "--seed", 7, "--overwrite").code == 0
+    outcome = freegeo("reconstruct", photo_folder, "-o", out, *tiny, "--adapter", adapter)
+    assert outcome.code == 2
+    assert "adapter.weights" in outcome.sentence()
+
+
+# -- interruption
+
+
+@pytest.mark.parametrize("stop_after", [1, 2])
+def test_interrupted_run_continues_to_the_same_result(
+    freegeo, finished, photo_folder, tiny, tmp_path, monkeypatch, stop_after
+):
+    out, steps = tmp_path / "out", []
+    plain = trainer._Run.step
+
+    def step(self, number):
+        if len(steps) == stop_after:
+            raise KeyboardInterrupt
+        steps.append(number)
+        return plain(self, number)
+
+    monkeypatch.setattr(trainer, "SAVE_EVERY_S", -1.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer._Run, "step", step)
+        if stop_after == 2:
+            # Adaptation is complete; the interruption comes while the files are written.
+            patch.setattr(formats, "export", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+            patch.setattr("freegeo.pipeline.export", formats.export)
+        outcome = freegeo("run", photo_folder, "-o", out, *tiny, *QUICK)
+    assert outcome.code == 130
+    assert "the same command continues" in outcome.sentence()
+    assert "reconstruction.json" not in files(out)
+    if stop_after == 1:
+        assert (out / "adapter" / STATE_FILE).is_file()
+    steps.clear()
+    monkeypatch.setattr(trainer._Run, "step", lambda self, number: (steps.append(number), plain(self, number))[1])
+    assert freegeo("run", photo_folder, "-o", out, *tiny, *QUICK).code == 0
+    assert steps == ([1] if stop_after == 1 else [])
+    assert same(prediction(out), prediction(finished))
+    assert files(out) == files(finished)
+
+
+def test_killed_process_continues_to_the_same_result(freegeo, finished, photo_folder, tiny, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["run", str(photo_folder), "-o", str(out), *tiny, *QUICK]
+    code = f"""
+import time
+from freegeo.adaptation import trainer
+from freegeo.cli.app import main
+plain = trainer._Run.step
+def step(self, number):
+    if number == 1:
+        time.sleep(120)
+    return plain(self, number)
+trainer._Run.step, trainer.SAVE_EVERY_S = step, -1.0
+main({arguments!r})
+"""
+    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 110
+    while not (out / "adapter" / STATE_FILE).is_file() and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert (out / "adapter" / STATE_FILE).is_file()
+    outcome = freegeo(*arguments)
+    assert outcome.code == 0, outcome.err
+    assert same(prediction(out), prediction(finished))
+    assert files(out) == files(finished)
+
+
+def test_two_processes_do_not_write_into_one_folder(freegeo, photo_folder, tiny, tmp_path):
+    from freegeo.storage import locked
+
+    with locked(tmp_path):
+        outcome = freegeo("run", photo_folder, "-o", tmp_path, *tiny, *QUICK)
+    assert outcome.code == 2
+    assert "another freegeo process" in outcome.sentence()

@@ -1,0 +1,325 @@
+"""Photos from folders, patterns and lists: which, in what order, how upright and in what colours; and every refusal."""
+
+import builtins
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from freegeo.data import photos
+from freegeo.data.photos import MAX_PIXELS, evenly_spaced, load_photos, natural_key, unique_names
+from freegeo.errors import UserError
+from png_header import png_header
+
+ORIENTATION = 0x0112
+# How the upright picture has to be turned before it is stored with each orientation (EXIF 2.32, tag 274).
+STORED = {
+    1: lambda a: a,
+    2: lambda a: a[:, ::-1],
+    3: lambda a: a[::-1, ::-1],
+    4: lambda a: a[::-1],
+    5: lambda a: a.transpose(1, 0, 2),
+    6: lambda a: np.rot90(a, 1),
+    7: lambda a: np.rot90(a, 2).transpose(1, 0, 2),
+    8: lambda a: np.rot90(a, -1),
+}
+
+
+def quarters(height=24, width=40) -> np.ndarray:
+    """Red, green, blue and white quarters: every turn and mirror of it is another picture."""
+    pixels = np.zeros((height, width, 3), np.uint8)
+    top, left = height // 2, width // 2
+    pixels[:top, :left, 0] = pixels[:top, left:, 1] = pixels[top:, :left, 2] = 255
+    pixels[top:, left:] = 255
+    return pixels
+
+
+def save(path: Path, pixels: np.ndarray | None = None, mode: str = "RGB", **options) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(quarters() if pixels is None else pixels).convert(mode).save(path, **options)
+    return path
+
+
+def names(source, **options) -> list[str]:
+    return [photo.name for photo in load_photos(source, **options)]
+
+
+def refusal(source) -> str:
+    """Return the sentence with which a source is refused, at the latest when the pixels are read."""
+    with pytest.raises(UserError) as caught:
+        for photo in load_photos(source):
+            photo.read()
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.endswith(".")
+    return message
+
+
+# -- which photos, in what order
+
+
+def test_folder_is_read_in_natural_order(tmp_path):
+    for name in ("frame10.png", "frame2.PNG", "Frame1.jpg", "a.webp", "b.tiff", "c.tif", "d.jpeg"):
+        save(tmp_path / name)
+    save(tmp_path / ".hidden.png")
+    save(tmp_path / "sub" / "x.png")
+    for system in ("Thumbs.db", "desktop.ini", ".DS_Store"):
+        (tmp_path / system).write_bytes(b"x")
+    expected = ["a.webp", "b.tiff", "c.tif", "d.jpeg", "Frame1.jpg", "frame2.PNG", "frame10.png"]
+    assert names(tmp_path) == names(str(tmp_path)) == expected
+
+
+def test_pattern_list_and_single_file(tmp_path):
+    files = [save(tmp_path / f"{k}.png") for k in (11, 2, 1)]
+    (tmp_path / "notes.txt").write_text("")
+    assert names(f"{tmp_path}/*.png") == ["1.png", "2.png", "11.png"]
+    assert names(files) == names([str(f) for f in files]) == ["11.png", "2.png", "1.png"]
+    assert names(files[0]) == ["11.png"]
+    save(tmp_path / "deep" / "er" / "3.png")
+    assert names(f"{tmp_path}/**/*.png") == ["1.png", "2.png", "11.png", "3.png"]
+
+
+def test_folder_with_brackets_in_its_name_is_a_folder(tmp_path):
+    save(tmp_path / "day[1]" / "a.png")
+    assert names(tmp_path / "day[1]") == ["a.png"]
+
+
+def test_at_most_max_views_evenly_first_and_last_included(tmp_path, caplog):
+    for k in range(10):
+        save(tmp_path / f"{k}.png")
+    with caplog.at_level(logging.INFO, "freegeo"):
+        assert names(tmp_path, max_views=4) == ["0.png", "3.png", "6.png", "9.png"]
+    assert "10 photos found, 4 kept" in caplog.text
+    assert len(names(tmp_path, max_views=10)) == 10
+    assert names(tmp_path, max_views=1) == ["0.png"]
+    with pytest.raises(UserError, match="--max-views"):
+        load_photos(tmp_path, max_views=0)
+
+
+@given(st.integers(1, 300), st.integers(1, 300))
+def test_even_choice_is_ascending_distinct_and_even(count, keep):
+    chosen = evenly_spaced(count, keep)
+    assert len(chosen) == min(count, keep)
+    assert chosen[0] == 0
+    steps = np.diff(chosen)
+    assert (steps >= 1).all()
+    if len(chosen) > 1:
+        assert chosen[-1] == count - 1
+        assert steps.max() - steps.min() <= 1
+
+
+@given(st.lists(st.text(min_size=1, max_size=8), min_size=1, max_size=8))
+def test_natural_order_exists_for_every_name(texts):
+    ordered = sorted((Path("folder") / text.replace("/", "_") for text in texts), key=natural_key)
+    assert len(ordered) == len(texts)
+
+
+@given(st.lists(st.integers(0, 10**6), min_size=2, max_size=8, unique=True))
+def test_natural_order_is_the_order_of_the_numbers(numbers):
+    ordered = sorted((Path(f"a/img_{n}_x.jpg") for n in numbers), key=natural_key)
+    assert [int(path.stem.split("_")[1]) for path in ordered] == sorted(numbers)
+
+
+def test_same_names_in_several_folders_are_told_apart(tmp_path):
+    files = [save(tmp_path / folder / "a.png") for folder in ("left", "right")]
+    assert names(files) == ["left/a.png", "right/a.png"]
+    assert "listed twice" in refusal([files[0], files[0]])
+    with pytest.raises(UserError, match="listed twice"):
+        unique_names([Path("/x/a.png"), Path("/x/a.png")])
+
+
+# -- pixels
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tiff"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photos_are_upright(tmp_path, suffix, orientation):
+    stored = Image.fromarray(np.ascontiguousarray(STORED[orientation](quarters())))
+    exif = Image.Exif()
+    exif[ORIENTATION] = orientation
+    stored.save(tmp_path / f"a{suffix}", exif=exif, quality=95)
+    (photo,) = load_photos(tmp_path)
+    assert photo.size_hw == (24, 40)
+    pixels = photo.read()
+    assert pixels.dtype == np.uint8
+    assert pixels.shape == (24, 40, 3)
+    # Corners, away from the edges that lossy formats blur.
+    for row, column in ((3, 5), (3, 34), (20, 5), (20, 34)):
+        assert np.abs(pixels[row, column].astype(int) - quarters()[row, column]).max() < 40
+
+
+@pytest.mark.parametrize("orientation", [0, 9, 77])
+def test_meaningless_orientation_is_ignored(tmp_path, orientation):
+    exif = Image.Exif()
+    exif[ORIENTATION] = orientation
+    save(tmp_path / "a.png", exif=exif)
+    (photo,) = load_photos(tmp_path)
+    assert photo.size_hw == (24, 40)
+    assert (photo.read() == quarters()).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "mode"), [("a.png", "RGB"), ("a.png", "P"), ("a.tiff", "RGB"), ("a.tif", "CMYK"), ("a.png", "RGBA")]
+)
+def test_modes_keep_their_colours(tmp_path, name, mode):
+    save(tmp_path / name, mode=mode)
+    assert np.abs(load_photos(tmp_path)[0].read().astype(int) - quarters()).max() <= 2
+
+
+def test_lossless_webp_is_exact(tmp_path):
+    save(tmp_path / "a.webp", lossless=True)
+    assert (load_photos(tmp_path)[0].read() == quarters()).all()
+
+
+def test_grey_is_spread_over_the_channels(tmp_path):
+    ramp = np.arange(240, dtype=np.uint8).reshape(12, 20)
+    save(tmp_path / "a.png", ramp, mode="L")
+    assert (load_photos(tmp_path)[0].read() == ramp[..., None]).all()
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_sixteen_bits_are_scaled_not_clipped(tmp_path, name):
+    ramp = np.linspace(0, 65535, 240).round().astype(np.uint16).reshape(12, 20)
+    Image.fromarray(ramp).save(tmp_path / name)
+    pixels = load_photos(tmp_path)[0].read()
+    assert np.abs(pixels - ramp[..., None] / 257).max() <= 0.5
+
+
+def test_transparent_pixels_become_white(tmp_path):
+    pixels = np.zeros((4, 4, 4), np.uint8)
+    pixels[:2] = (255, 0, 0, 255)
+    pixels[2] = (255, 0, 0, 51)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    read = load_photos(tmp_path)[0].read()
+    assert (read[0] == (255, 0, 0)).all()
+    assert np.abs(read[2].astype(int) - (255, 204, 204)).max() <= 1
+    assert (read[3] == 255).all()
+
+
+def test_palette_with_a_transparent_colour(tmp_path):
+    image = Image.fromarray(quarters()).convert("P")
+    image.save(tmp_path / "a.png", transparency=image.getpixel((0, 0)))
+    read = load_photos(tmp_path)[0].read()
+    assert (read[0, 0] == 255).all()
+    assert (read[0, -1] == (0, 255, 0)).all()
+
+
+# -- refusals
+
+
+def test_no_photos(tmp_path):
+    assert "no photos found" in refusal(tmp_path)
+    (tmp_path / "notes.txt").write_text("")
+    assert "no photos found" in refusal(tmp_path)
+    assert "no photos found" in refusal(f"{tmp_path}/*.png")
+    assert "no photos found" in refusal([])
+    assert "no such folder" in refusal(tmp_path / "missing")
+
+
+def test_other_files_in_the_folder(tmp_path):
+    save(tmp_path / "a.JPG")
+    (tmp_path / "notes.txt").write_text("")
+    message = refusal(tmp_path)
+    assert "1 of 2 files are no photos (first: notes.txt)" in message
+    assert f"'{tmp_path}/*.JPG'" in message
+    assert names(f"{tmp_path}/*.JPG") == ["a.JPG"]
+
+
+def test_list_with_something_else_in_it(tmp_path):
+    photo = save(tmp_path / "a.png")
+    (tmp_path / "notes.txt").write_text("")
+    assert "not a photo" in refusal([photo, tmp_path / "notes.txt"])
+    assert "no such file" in refusal([photo, tmp_path / "b.png"])
+    assert "a folder among several sources" in refusal([photo, tmp_path])
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tiff", ".heic"])
+def test_file_that_is_no_image(tmp_path, suffix):
+    (tmp_path / f"a{suffix}").write_bytes(b"no image at all")
+    assert f"a{suffix}: the file is not a readable image" in refusal(tmp_path)
+
+
+def test_empty_file(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(b"")
+    assert "a.jpg" in refusal(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def encoded(tmp_path_factory) -> dict[str, bytes]:
+    """The same noise in every format."""
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    folder = tmp_path_factory.mktemp("encoded")
+    noise = np.random.default_rng(0).integers(0, 256, (40, 48, 3), dtype=np.uint8)
+    return {s: save(folder / f"a{s}", noise).read_bytes() for s in (".jpg", ".png", ".webp", ".tiff", ".heic")}
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tiff", ".heic"])
+@pytest.mark.parametrize("share", [0.3, 0.9])
+def test_truncated_image(tmp_path, encoded, suffix, share):
+    data = encoded[suffix]
+    (tmp_path / f"a{suffix}").write_bytes(data[: int(len(data) * share)])
+    assert f"a{suffix}: the " in refusal(tmp_path)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+@pytest.mark.filterwarnings("ignore::UserWarning:PIL")
+def test_damaged_images_are_read_or_refused(tmp_path, encoded, data):
+    suffix = data.draw(st.sampled_from(sorted(encoded)))
+    content = bytearray(encoded[suffix])
+    for _ in range(data.draw(st.integers(1, 12))):
+        content[data.draw(st.integers(0, min(len(content), 600) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(content)
+    try:
+        (photo,) = load_photos(path)
+        pixels = photo.read()
+    except UserError as error:
+        assert path.name in str(error)
+    else:
+        assert pixels.shape == (*photo.size_hw, 3)
+
+
+@pytest.mark.parametrize("side", [12_248, 20_000])
+def test_image_above_the_pixel_limit_is_refused_by_its_header(tmp_path, side, recwarn):
+    assert side**2 > MAX_PIXELS
+    (tmp_path / "a.png").write_bytes(png_header(side, side))
+    assert "more than the limit of 150 megapixels" in refusal(tmp_path)
+    assert not recwarn.list
+
+
+def test_limit_is_ours_not_pillows(tmp_path, monkeypatch, recwarn):
+    save(tmp_path / "a.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 600)
+    monkeypatch.setattr(photos, "MAX_PIXELS", 24 * 40)
+    (photo,) = load_photos(tmp_path)
+    assert (photo.read() == quarters()).all()
+    assert not recwarn.list
+    monkeypatch.setattr(photos, "MAX_PIXELS", 24 * 40 - 1)
+    assert "40 x 24 pixels are more than the limit" in refusal(tmp_path)
+
+
+def test_heic_without_the_extra_names_it(tmp_path, monkeypatch):
+    (tmp_path / "a.heic").write_bytes(b"")
+    plain = builtins.__import__
+
+    def without_heif(name, *args, **options):
+        if name == "pillow_heif":
+            raise ImportError(name)
+        return plain(name, *args, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without_heif)
+    assert "freegeo[heif]" in refusal(tmp_path)
+
+
+def test_heic_with_the_extra(tmp_path, encoded):
+    (tmp_path / "a.HEIC").write_bytes(encoded[".heic"])
+    (photo,) = load_photos(tmp_path)
+    assert photo.read().shape == (40, 48, 3)
+    assert photos.HEIF_SUFFIXES.isdisjoint(photos.PHOTO_SUFFIXES)

@@ -1,0 +1,118 @@
+"""The imports of the package, read as text, keep to the table of docs/architecture.md."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "src" / "freegeo"
+ANYWHERE = {"types", "errors", "storage", "__init__"}
+ALLOWED = {
+    "pipeline": {"models", "data", "adaptation", "fusion", "export", "report"},
+    "benchmark": {"adaptation", "models", "data", "fusion", "geometry"},
+    "training": {"models", "data", "benchmark", "geometry"},
+    "adaptation": {"models", "data.scene", "geometry"},
+    "report": {"export", "geometry"},
+    "export": {"fusion", "geometry"},
+    "fusion": {"geometry"},
+    "data": {"geometry"},
+    "models": {"geometry"},
+    "geometry": set(),
+    "types": set(),
+    "errors": set(),
+    "storage": set(),
+    "__init__": set(),
+}
+HEAVY = {
+    "peft", "scipy", "cv2", "trimesh", "matplotlib", "huggingface_hub", "mcubes", "av", "pycolmap", "viser",
+    "transformers", "jinja2", "ray", "open3d", "pillow_heif",
+}  # fmt: skip
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+def name_of(file: Path) -> str:
+    return file.relative_to(PACKAGE).as_posix()
+
+
+def tree_of(file: Path) -> ast.Module:
+    return ast.parse(file.read_text(encoding="utf-8"))
+
+
+def imported(node: ast.AST) -> list[str]:
+    """Return the full names that a statement imports."""
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    if isinstance(node, ast.ImportFrom):
+        assert node.level == 0, "relative import"
+        return [f"{node.module}.{alias.name}" for alias in node.names]
+    return []
+
+
+def at_import_time(tree: ast.Module) -> Iterator[ast.AST]:
+    """Walk what runs when a module is imported: no function bodies, nothing that only a type checker sees."""
+    waiting: list[ast.AST] = list(tree.body)
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            continue
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            waiting.extend(node.orelse)
+            continue
+        yield node
+        waiting.extend(ast.iter_child_nodes(node))
+
+
+def room_of(file: Path) -> str:
+    return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def entered(file: Path) -> set[str]:
+    """Return the parts of the package that a file imports, wherever in the file; types count too."""
+    own = [name for node in ast.walk(tree_of(file)) for name in imported(node) if name.split(".")[0] == "freegeo"]
+    return {".".join(name.split(".")[1:]) for name in own if "." in name}
+
+
+def may_enter(room: str, target: str) -> bool:
+    head = target.split(".")[0]
+    if head in ANYWHERE or head.startswith("__") or head == room:
+        return True
+    return any(target == allowed or target.startswith(f"{allowed}.") for allowed in ALLOWED[room])
+
+
+def test_every_room_has_a_rule():
+    assert {room_of(file) for file in FILES} <= set(ALLOWED) | {"cli"}
+
+
+@pytest.mark.parametrize("file", [f for f in FILES if room_of(f) != "cli"], ids=name_of)
+def test_rooms_are_entered_as_allowed(file):
+    wrong = {target for target in entered(file) if not may_enter(room_of(file), target)}
+    assert not wrong
+
+
+def test_nobody_imports_the_command_line():
+    assert not [name_of(f) for f in FILES if room_of(f) != "cli" and any(t.startswith("cli") for t in entered(f))]
+
+
+@pytest.mark.parametrize("file", FILES, ids=name_of)
+def test_heavy_packages_are_imported_where_they_are_used(file):
+    at_once = {name.split(".")[0] for node in at_import_time(tree_of(file)) for name in imported(node)}
+    assert at_once.isdisjoint(HEAVY), sorted(at_once & HEAVY)
+
+
+@pytest.mark.parametrize("file", [f for f in FILES if room_of(f) != "cli"], ids=name_of)
+def test_only_commands_print(file):
+    calls = [node for node in ast.walk(tree_of(file)) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)]
+    assert not [call.lineno for call in calls if call.func.id == "print"]
+
+
+def test_the_rule_finds_what_breaks_it():
+    """The checks above are only worth something if they see a forbidden import."""
+    assert not may_enter("models", "data.photos")
+    assert not may_enter("adaptation", "data.photos")
+    assert may_enter("adaptation", "data.scene.Scene")
+    assert may_enter("benchmark", "benchmark.pose")
+    tree = ast.parse(
+        "import scipy\nif TYPE_CHECKING:\n    import cv2\ndef f():\n    import peft\nclass C:\n    import av\n"
+    )
+    assert {name for node in at_import_time(tree) for name in imported(node)} == {"scipy", "av"}
