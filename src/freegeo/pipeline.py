@@ -29,6 +29,7 @@ from freegeo.export.reconstruction import FILE_NAME as PREDICTION_NAME
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.fusion.filtering import FilterReport, FilterSettings
 from freegeo.models.precision import Precision, autocast
+from freegeo.report.page import write_report
 from freegeo.storage import FORMAT, RunFolder, read_json, write_json
 from freegeo.types import ImageBatch, PhotoLike
 
@@ -160,6 +161,8 @@ class Job:
         summary = self._summary(final, frozen, report)
         write_json(self.folder / SUMMARY_NAME, summary)
         self.after(self)
+        self.hooks.stage("report")
+        write_report(self.folder.path)
         self.folder.finish()
         return summary
 

@@ -3,12 +3,13 @@
 import pytest
 
 from freegeo.cli import sources
+from freegeo.cli.options import PhotoOptions
 from freegeo.errors import UserError
 
 
 def test_demo_is_a_source_of_photos(monkeypatch):
     monkeypatch.setattr(sources, "DEMO_FRAMES", 3)
-    found = sources.load_source(["demo"], 2)
+    found = sources.load_source(["demo"], PhotoOptions(max_views=2))
     assert [photo.name for photo in found] == ["00.png", "01.png"]
     assert found[0].read().shape == (*found[0].size_hw, 3)
 
@@ -25,6 +26,6 @@ def test_files_are_one_scene_and_folders_are_several(tmp_path):
 
 @pytest.mark.parametrize("given", [[], [""]])
 def test_no_source(given):
-    for ask in (sources.split_scenes, lambda names: sources.load_source(names, 4)):
+    for ask in (sources.split_scenes, lambda names: sources.load_source(names, PhotoOptions())):
         with pytest.raises(UserError, match="no source given"):
             ask(given)

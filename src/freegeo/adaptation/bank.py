@@ -79,7 +79,9 @@ class ViewBank:
         arithmetic: Callable[[], AbstractContextManager],
     ):
         self.model, self.recipe, self.engine, self.arithmetic = model, recipe, engine, arithmetic
-        self._cache = TensorCache(engine.cache_place, engine.device, folder=engine.cache_folder, half=engine.half_cache)
+        self._cache = TensorCache(
+            "tokens", engine.cache_place, engine.device, folder=engine.cache_folder, half=engine.half_cache
+        )
         self._sizes: dict[int, tuple[tuple[int, int], tuple[int, int]]] = {}
         self._uses = Counter(key for view_set, positions in planned for key in set(self._keys(view_set, positions)))
         self._images = ImageQueue(scenes, list(self._requests(planned)), ahead=engine.images_ahead)

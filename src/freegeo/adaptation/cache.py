@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Hashable, Mapping
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from freegeo.errors import UserError
+
 Place = Literal["device", "host", "disk"]
 LARGEST_HALF = torch.finfo(torch.float16).max
 
@@ -17,16 +20,17 @@ LARGEST_HALF = torch.finfo(torch.float16).max
 class TensorCache:
     """Groups of named tensors by key; what is read back is on the device and of the type that was put in."""
 
-    def __init__(self, place: Place, device: torch.device, *, folder: Path | None = None, half: bool = False):
+    def __init__(
+        self, name: str, place: Place, device: torch.device, *, folder: Path | None = None, half: bool = False
+    ):
+        """`folder` belongs to one run at a time: what a killed run left there under the same `name` is removed."""
         self.place, self.device, self.half = place, device, half
         self._groups: dict[Hashable, dict[str, Tensor] | Path] = {}
         self._dtypes: dict[Hashable, dict[str, torch.dtype]] = {}
         self._files = 0
-        self._folder: tempfile.TemporaryDirectory | None = None
+        self._folder: Path | None = None
         if place == "disk":
-            if folder is not None:
-                folder.mkdir(parents=True, exist_ok=True)
-            self._folder = tempfile.TemporaryDirectory(prefix="freegeo-cache-", dir=folder)
+            self._folder = _empty_folder(name, folder)
 
     def __contains__(self, key: Hashable) -> bool:
         return key in self._groups
@@ -57,7 +61,7 @@ class TensorCache:
         """Forget everything and remove the files."""
         self._groups.clear()
         if self._folder is not None:
-            self._folder.cleanup()
+            shutil.rmtree(self._folder, ignore_errors=True)
 
     def rounded(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return what `get` would after `put`, so that a group gives the same result kept or not."""
@@ -80,13 +84,26 @@ class TensorCache:
         if self._folder is not None:
             from safetensors.torch import save_file
 
-            path = Path(self._folder.name) / f"{self._files}.safetensors"
+            path = self._folder / f"{self._files}.safetensors"
             self._files += 1
             save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, path)
             return path
         if self.place == "host" and self.device.type == "cuda":
             return {name: tensor.cpu().pin_memory() for name, tensor in tensors.items()}
         return {name: tensor.cpu() if self.place == "host" else tensor for name, tensor in tensors.items()}
+
+
+def _empty_folder(name: str, parent: Path | None) -> Path:
+    if parent is None:
+        return Path(tempfile.mkdtemp(prefix=f"freegeo-{name}-"))
+    folder = parent / f"freegeo-{name}-cache"
+    try:
+        if folder.exists():
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written to ({error.strerror}). Choose another cache folder.") from None
+    return folder
 
 
 def _mapped(path: Path) -> dict[str, Tensor]:

@@ -12,11 +12,16 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
+from freegeo.adaptation.losses.numerics import CPU_BLOCK_ELEMENTS, DEVICE_BLOCK_ELEMENTS
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Precision, encoder
 
 WIDE = 4
 """Bytes of a float32: the residual stream, norms, features, losses, trained parameters."""
+LORA = ".lora_"
+"""Part of the names of trained parameters."""
+TRIPLET_ARRAYS = 13
+"""Arrays with one number per triplet that live together while the angle terms are computed."""
 
 
 def narrow(precision: Precision) -> int:
@@ -55,13 +60,14 @@ def shape_of(model: ReconstructionModel) -> Shape:
     contraction = [linear for linear in linears if linear.out_features == width and linear.in_features != width]
     expansion = [linear for linear in linears if linear.in_features == width and linear.out_features > width]
     hidden = contraction[0].in_features if contraction else width
+    every = {id(p): p.numel() for name, p in model.named_parameters() if LORA not in name}
     casts = {
         id(parameter): parameter.numel()
         for module in encoder(part).modules()
-        if isinstance(module, nn.Linear | nn.Conv2d) and not _trained(module)
+        if isinstance(module, nn.Linear)
         for parameter in module.parameters(recurse=False)
+        if id(parameter) in every
     }
-    every = sum(parameter.numel() for parameter in model.parameters() if not parameter.requires_grad)
     return Shape(
         width=width,
         heads=max(1, width // 64),
@@ -70,7 +76,7 @@ def shape_of(model: ReconstructionModel) -> Shape:
         gated=any(linear.out_features == 2 * hidden for linear in expansion),
         linear_parameters=sum(casts.values()),
         adapted_parameters=sum(linear.weight.numel() for linear in linears),
-        other_parameters=every - sum(casts.values()),
+        other_parameters=sum(every.values()) - sum(casts.values()),
         # Both families put the outputs of two blocks beside each other.
         channels=2 * width,
         special=part.spec.special_tokens,
@@ -78,11 +84,9 @@ def shape_of(model: ReconstructionModel) -> Shape:
 
 
 def _base(module: nn.Module) -> nn.Linear:
-    return getattr(module, "base_layer", module)  # type: ignore[return-value]
-
-
-def _trained(module: nn.Module) -> bool:
-    return any(parameter.requires_grad for parameter in module.parameters(recurse=False))
+    linear = getattr(module, "base_layer", module)
+    assert isinstance(linear, nn.Linear)
+    return linear
 
 
 def weights(shape: Shape, *, half: bool) -> int:
@@ -105,8 +109,8 @@ def saved_per_token(shape: Shape, precision: Precision, *, rank: int, dropout: b
     statistics = WIDE * (4 + 5 * shape.heads)
     total = norm_inputs + lora_inputs + attention + feed_forward + statistics + 4 * rank * e
     if dropout:
-        # Masks are bytes in CUDA's fused dropout and numbers elsewhere.
-        total += (3 * d + h) * (1 if device.type == "cuda" else WIDE)
+        # A mask is one byte per element in CUDA's fused dropout and in ours on the CPU, elsewhere a number.
+        total += (3 * d + h) * (WIDE if device.type == "mps" else 1)
     return total
 
 
@@ -131,14 +135,16 @@ def features(shape: Shape, tokens: int, layers: int) -> int:
 def student(
     shape: Shape, precision: Precision, *, tokens: int, layers: int, rank: int, dropout: bool, recompute: bool,
     stored_half: bool, device: torch.device,
-) -> int:  # fmt: skip
-    """Peak of the student's forward and backward pass over a micro-batch of `tokens` tokens, without the losses."""
+) -> tuple[int, int]:  # fmt: skip
+    """What the student's pass over a micro-batch of `tokens` tokens leaves, and what its backward pass adds to that."""
     saved = saved_per_token(shape, precision, rank=rank, dropout=dropout, device=device)
-    if recompute:
-        kept = tokens * (shape.blocks * WIDE * shape.width + saved)
-    else:
-        kept = tokens * shape.blocks * saved + half_copies(shape, precision, stored_half=stored_half)
-    return kept + tokens * passing(shape, precision, with_adapter=True) + features(shape, tokens, layers)
+    per_block = WIDE * shape.width if recompute else saved
+    left = tokens * shape.blocks * per_block + features(shape, tokens, layers)
+    if not recompute:
+        left += half_copies(shape, precision, stored_half=stored_half)
+    gradients = WIDE * layers * tokens * shape.channels
+    again = tokens * saved if recompute else 0
+    return left, gradients + again + tokens * passing(shape, precision, with_adapter=True)
 
 
 def teacher(shape: Shape, precision: Precision, *, tokens: int, layers: int, stored_half: bool) -> int:
@@ -147,10 +153,11 @@ def teacher(shape: Shape, precision: Precision, *, tokens: int, layers: int, sto
     return tokens * passing(shape, precision, with_adapter=False) + features(shape, tokens, layers) + copies
 
 
-def losses(shape: Shape, *, tokens: int, layers: int, triplets: int, batch: int) -> int:
+def losses(shape: Shape, *, tokens: int, layers: int, triplets: int, batch: int, device: torch.device) -> int:
     """Gradients of all features, four blocks of the intra sweep, and the arrays over triplets."""
     level = WIDE * tokens * shape.channels
-    return level * layers + 4 * min(level, WIDE << 25) + 16 * WIDE * triplets * batch
+    block = WIDE * (CPU_BLOCK_ELEMENTS if device.type == "cpu" else DEVICE_BLOCK_ELEMENTS)
+    return level * layers + 4 * min(level, block) + TRIPLET_ARRAYS * WIDE * triplets * batch
 
 
 def token_bytes(shape: Shape, tokens: int) -> int:

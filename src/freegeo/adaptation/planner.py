@@ -124,7 +124,7 @@ def choose_adaptation(
         smallest = plan
         on_host = plan.cache_bytes if candidate.cache_place == "host" else 0
         if plan.peak_bytes <= budget and on_host <= host_budget:
-            plan = _widened(job, plan, recipe)
+            plan = _widened(job, plan, recipe, budget)
             logger.info("%s", plan.summary())
             return plan
     assert smallest is not None
@@ -142,15 +142,14 @@ def _candidates(engine: Engine) -> Iterator[Engine]:
             yield replace(engine, cache_place=place, micro_batch=1, recompute_blocks=recompute)
 
 
-def _widened(job: _Job, plan: AdaptationPlan, recipe: Recipe) -> AdaptationPlan:
+def _widened(job: _Job, plan: AdaptationPlan, recipe: Recipe, budget: int) -> AdaptationPlan:
     """Raise the micro-batch while it fits and while an accelerator has room for it; the CPU gains nothing by it."""
     if plan.engine.device.type == "cpu" or recipe.dropout > 0:
         return plan
-    assert plan.budget is not None
     while plan.engine.micro_batch < recipe.batch:
         wider = replace(plan.engine, micro_batch=plan.engine.micro_batch + 1)
         parts = tuple(job.parts(wider))
-        if job.student_tokens(wider) > BUSY_TOKENS or sum(size for _, size in parts) > plan.budget:
+        if job.student_tokens(wider) > BUSY_TOKENS or sum(size for _, size in parts) > budget:
             break
         plan = replace(plan, engine=wider, parts=parts)
     return plan
@@ -165,7 +164,6 @@ class _Job:
         self.trained = count_trainable(model, recipe.rank)
         patch = model.adaptable().spec.patch_size
         self.tokens = [(h // patch) * (w // patch) + self.shape.special for _, (h, w) in scenes]
-        self.pixels = [h * w for _, (h, w) in scenes]
         self.steps = schedule([count for count, _ in scenes], recipe, seed)
         self.sets = list(dict.fromkeys(visit.view_set for visits in self.steps for visit in visits))
 
@@ -180,31 +178,32 @@ class _Job:
         student_tokens = self.student_tokens(engine)
         yield "weights", footprint.weights(shape, half=engine.half_weights)
         yield "adapter and optimiser", footprint.trained(self.trained)
-        prefix, targets = self.cache(engine)
-        if engine.cache_place == "device":
-            yield "tokens of images", prefix
-            yield "teacher targets", targets
-        targets_now = max(self._targets(s, visits=1) for s in self.sets) * engine.micro_batch
+        prefix, targets = self.cache(engine) if engine.cache_place == "device" else (0, 0)
+        targets_now = max(self._targets(s, visits=1) for s in self.sets)
         teacher = footprint.teacher(
             shape, precision, tokens=teacher_tokens, layers=self.layers, stored_half=engine.half_weights
         )
         teacher += footprint.token_bytes(shape, 2 * teacher_tokens) + targets_now
-        student = footprint.student(
+        student, backward = footprint.student(
             shape, precision, tokens=student_tokens, layers=self.layers, rank=recipe.rank, dropout=recipe.dropout > 0,
             recompute=engine.recompute_blocks, stored_half=engine.half_weights, device=engine.device,
         )  # fmt: skip
         losses = footprint.losses(
-            shape, tokens=student_tokens, layers=self.layers, triplets=self._triplets(), batch=engine.micro_batch
-        )
-        inputs = footprint.token_bytes(shape, student_tokens) + (
-            targets_now if engine.cache_place != "device" or not engine.cache_teacher else 0
-        )
-        if teacher > student + losses + inputs:
+            shape, tokens=student_tokens, layers=self.layers, triplets=self._triplets(), batch=engine.micro_batch,
+            device=engine.device,
+        )  # fmt: skip
+        inputs = footprint.token_bytes(shape, student_tokens)
+        inputs += 0 if targets and engine.micro_batch == 1 else targets_now * engine.micro_batch
+        yield "tokens of images", prefix
+        # While the teacher runs for the last time, the targets that it makes are still missing.
+        if teacher - targets_now > student + max(losses, backward) + inputs:
+            yield "teacher targets", max(0, targets - targets_now)
             yield "teacher's pass", teacher
-        else:
-            yield "student's passes", student
-            yield "losses", losses
-            yield "inputs of a step", inputs
+            return
+        yield "teacher targets", targets
+        yield "student's pass", student
+        yield ("losses", losses) if losses > backward else ("backward pass", backward)
+        yield "inputs of a step", inputs
 
     def cache(self, engine: Engine) -> tuple[int, int]:
         """Bytes of the tokens and of the targets that are kept, each at its fullest moment."""

@@ -96,7 +96,9 @@ class TeacherBank:
     ):
         self.adapter, self.bank, self.recipe = adapter, bank, recipe
         self.config, self.seed, self.engine, self.arithmetic = recipe.loss, seed, engine, arithmetic
-        self._cache = TensorCache(engine.cache_place, engine.device, folder=engine.cache_folder, half=engine.half_cache)
+        self._cache = TensorCache(
+            "targets", engine.cache_place, engine.device, folder=engine.cache_folder, half=engine.half_cache
+        )
         self._entries: dict[SetKey, _Entry] = {}
         self._precisions: dict[SetKey, Precision | None] = {}
         self._steps: dict[SetKey, list[int]] = {}
@@ -149,7 +151,9 @@ class TeacherBank:
     def _once(self, visit: Visit) -> Comparison:
         levels = self._features(visit.view_set)
         draws = self._draws(levels, visit.view_set, visit.step)
-        return self._comparison(visit, teacher_targets(levels, visit.view_set.kept, draws, self.config), draws)
+        targets = teacher_targets(levels, visit.view_set.kept, draws, self.config)
+        # Compact copies, so that the full features of all views can go.
+        return self._comparison(visit, TeacherTargets.from_tensors(targets.tensors()), draws)
 
     def _compute(self, key: SetKey, visit: Visit) -> None:
         """Run the teacher and keep compact copies, so that the full features of all views can go."""
@@ -204,7 +208,10 @@ def stacked(comparisons: Sequence[Comparison]) -> Comparison:
         return comparisons[0]
     targets = [comparison.targets for comparison in comparisons]
     kept = {
-        layer: tuple(torch.cat([one.kept[layer][part] for one in targets]) for part in (0, 1))
+        layer: (
+            torch.cat([one.kept[layer][0] for one in targets]),
+            torch.cat([one.kept[layer][1] for one in targets]),
+        )
         for layer in targets[0].kept
     }
     angle = torch.cat([one.anchors.angle for one in targets])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.bank import ViewBank, accesses
+from freegeo.adaptation.dropout import pack_dropout
 from freegeo.adaptation.engine import Engine
 from freegeo.adaptation.images import SceneImages
 from freegeo.adaptation.losses import adaptation_loss, require_finite
@@ -114,7 +115,7 @@ def adapt(
                 saved_at = time.monotonic()
         stack.pop_all()
         run.close()
-    result.curve = _floats(result.curve)
+    result.curve = _floats(run.curve)
     result.seconds += time.monotonic() - started
     return result
 
@@ -122,7 +123,7 @@ def adapt(
 class _Watch:
     """Stops a run whose loss or gradient is not finite, before the optimiser changes anything.
 
-    On the CPU the numbers are read at once. Elsewhere the device itself leaves the update out, and the host reads the
+    Usually the numbers are read at once. On CUDA the device itself leaves the update out, and the host reads the
     verdict of a step after it has queued the next one, so that the device never waits for it.
     """
 
@@ -170,12 +171,15 @@ class _Run:
         self.result, self.steps, self.engine, self.folder = result, steps, engine, folder
         self.adapter, self.recipe, self.seed = result.adapter, result.recipe, result.seed
         self.arithmetic = partial(autocast, engine.device, engine.precision)
+        if engine.device.type == "cpu":
+            pack_dropout(self.adapter)
         if engine.half_weights:
             cast_linears(self.adapter.model, engine.precision)
         parameters = self.adapter.parameters()
         self.optimiser = torch.optim.AdamW(parameters, lr=0.0, weight_decay=self.recipe.weight_decay, fused=True)
         self.scaler = torch.amp.GradScaler(engine.device.type, enabled=engine.precision == "fp16")
-        self.watch = _Watch(at_once=engine.device.type == "cpu")
+        self.watch = _Watch(at_once=engine.device.type != "cuda")
+        self.curve: list[Mapping[str, float | Tensor]] = []
         self.identity = run_identity(self.adapter.model.spec.name, scenes, self.recipe, self.seed)
         self.first = self._restore()
         ahead = steps[self.first :]
@@ -205,24 +209,31 @@ class _Run:
                 factor = torch.where(loss.detach().isfinite(), share, torch.nan)
                 self.scaler.scale(loss * factor).backward()
                 parts.append({name: term * share for name, term in terms.items()})
+                # What the next view set needs shall not meet what this one needed.
+                del tokens, comparison, loss
         terms = {name: torch.stack([part[name] for part in parts]).sum() for name in parts[0]}
         self._update(step, terms)
-        self.result.curve.append(terms)  # type: ignore[arg-type]
+        self.curve.append(terms)
         return terms
 
     def _batches(self, visits: Sequence[Visit]) -> Iterator[tuple[ViewTokens, Comparison]]:
         """Yield student tokens and targets; successive view sets of equal shape share a batch up to the micro-batch."""
         waiting: list[tuple[ViewTokens, Comparison]] = []
         for visit in visits:
-            comparison = self.teacher.targets(visit)
-            tokens = self.bank.tokens(visit.view_set, visit.view_set.kept)
-            if waiting and (
-                len(waiting) == self.engine.micro_batch or _shape(waiting[0]) != _shape((tokens, comparison))
-            ):
+            waiting.append(self._inputs(visit))
+            if _shape(waiting[-1]) != _shape(waiting[0]):
+                odd = waiting.pop()
+                yield _joined(waiting)
+                waiting = [odd]
+            if len(waiting) == self.engine.micro_batch:
                 yield _joined(waiting)
                 waiting = []
-            waiting.append((tokens, comparison))
-        yield _joined(waiting)
+        if waiting:
+            yield _joined(waiting)
+
+    def _inputs(self, visit: Visit) -> tuple[ViewTokens, Comparison]:
+        comparison = self.teacher.targets(visit)
+        return self.bank.tokens(visit.view_set, visit.view_set.kept), comparison
 
     def _compare(self, tokens: ViewTokens, comparison: Comparison) -> tuple[Tensor, dict[str, Tensor]]:
         model = self.adapter.model
@@ -243,12 +254,13 @@ class _Run:
         else:
             self.watch.see(step, {**terms, GRADIENT: norm.detach()})
             if not self.watch.at_once:
-                self.optimiser.found_inf = (~norm.isfinite()).float()
+                # The fused optimiser reads this attribute, as it does for gradient scalers.
+                vars(self.optimiser)["found_inf"] = (~norm.isfinite()).float()
         self.scaler.step(self.optimiser)
         self.scaler.update()
 
     @contextmanager
-    def _training(self, step: int) -> Iterator[None]:
+    def _training(self, step: int) -> Generator[None]:
         """Dropout on, seeded by the step so that a resumed run draws the same masks; checkpointing as asked."""
         model = self.adapter.model
         model.train(self.recipe.dropout > 0)
@@ -265,11 +277,11 @@ class _Run:
         """Write a state that goes on with `next_step`."""
         assert self.folder is not None
         self.watch.check()
-        self.result.curve = _floats(self.result.curve)
+        self.curve = list(_floats(self.curve))
         about = {
             "identity": self.identity,
             "next_step": next_step,
-            "curve": self.result.curve,
+            "curve": self.curve,
             "seconds": self.result.seconds + elapsed,
             "scaler": self.scaler.state_dict(),
         }
@@ -288,7 +300,7 @@ class _Run:
         if about is None:
             return 0
         self.scaler.load_state_dict(about["scaler"])
-        self.result.curve, self.result.seconds = about["curve"], about["seconds"]
+        self.curve, self.result.seconds = about["curve"], about["seconds"]
         return about["next_step"]
 
 
@@ -312,5 +324,5 @@ def _cuda_devices(device: torch.device) -> list[torch.device]:
     return [device] if device.type == "cuda" else []
 
 
-def _floats(curve: list) -> list[dict[str, float]]:
+def _floats(curve: Sequence[Mapping[str, float | Tensor]]) -> list[dict[str, float]]:
     return [{name: float(value) for name, value in terms.items()} for terms in curve]

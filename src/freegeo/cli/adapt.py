@@ -37,13 +37,13 @@ def adapt(
     Parameters
     ----------
     sources
-        Folders of photos (each a scene), globs in quotes, photo files (together one scene), or `demo`.
+        Folders of photos (each a scene), globs in quotes, photo files (together one scene), videos, or `demo`.
     """
     from freegeo.adaptation.bank import SceneImages
     from freegeo.pipeline import require_enough_photos, settings_of
     from freegeo.storage import check_folder, run_folder
 
-    scenes = {str(part[0]): load_source(part, photos.max_views) for part in split_scenes(sources)}
+    scenes = {str(part[0]): load_source(part, photos) for part in split_scenes(sources)}
     for found in scenes.values():
         require_enough_photos(found)
     loaded = model.load()

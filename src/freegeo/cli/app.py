@@ -35,6 +35,7 @@ COMMANDS = {
     "adapt": ("freegeo.cli.adapt:adapt", "Adapt a model to one or several scenes and save the adapter."),
     "reconstruct": ("freegeo.cli.reconstruct:reconstruct", "Reconstruct with a frozen model or a saved adapter."),
     "export": ("freegeo.cli.export:export", "Write a reconstruction as ply, glb, mesh, colmap, nerfstudio, depth."),
+    "view": ("freegeo.cli.view:view", "Look at results in the browser, before and after adaptation."),
     "bench": ("freegeo.cli.bench:app", "Published evaluation: datasets, tables, comparison with the paper."),
     "models": ("freegeo.cli.models:app", "List, describe, download and check models."),
     "train-tiny": ("freegeo.cli.train_tiny:train_tiny", "Train the embedded model on generated rooms."),

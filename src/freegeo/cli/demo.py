@@ -16,6 +16,7 @@ from freegeo.storage import read_json, write_json
 
 if TYPE_CHECKING:
     from freegeo.data.scene import Scene
+    from freegeo.export.reconstruction import Reconstruction
     from freegeo.pipeline import Job
 
 SCORES_NAME = "scores.json"
@@ -56,6 +57,7 @@ def demo(
 
     def add_scores(job: Job) -> None:
         save_photos(scene, output / "photos")
+        true_reconstruction(job, scene).save(output / "truth")
         write_json(output / SCORES_NAME, score_windows(job, scene))
 
     run_job(
@@ -73,6 +75,18 @@ def save_photos(scene: Scene, folder: Path) -> None:
     for photo in scene.photos:
         with atomic_path(folder / f"{Path(photo.name).stem}.png") as part:
             Image.fromarray(photo.read()).save(part)
+
+
+def true_reconstruction(job: Job, scene: Scene) -> Reconstruction:
+    """Return the ground truth at the model's size, for the report."""
+    from freegeo.benchmark.scene_score import at_size
+    from freegeo.export.reconstruction import Reconstruction
+    from freegeo.types import Prediction
+
+    assert scene.depth_z is not None and scene.K is not None
+    size = (job.batch.images.shape[-2], job.batch.images.shape[-1])
+    depth_z, K = at_size(scene.depth_z, scene.K, size)
+    return Reconstruction.from_prediction(Prediction(depth_z=depth_z, T_cam_world=scene.T_cam_world, K=K), job.batch)
 
 
 def score_windows(job: Job, scene: Scene) -> dict[str, Any]:

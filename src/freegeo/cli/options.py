@@ -136,6 +136,8 @@ class PhotoOptions:
 
     max_views: int = 32
     """Most photos that are used; of more, as many are chosen evenly."""
+    fps: float | None = None
+    """Videos: take a frame this often per second; default: by sharpness and parallax."""
 
 
 @Parameter(name="*")

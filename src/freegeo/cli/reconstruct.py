@@ -25,10 +25,10 @@ def reconstruct(
     Parameters
     ----------
     sources
-        A folder of photos, a glob in quotes, photo files, or `demo` (a generated room).
+        A folder of photos, a glob in quotes, photo files, a video, or `demo` (a generated room).
     adapter
         Folder of a saved adapter; without it the frozen model is used.
     """
-    found = load_source(sources, photos.max_views)
+    found = load_source(sources, photos)
     loaded = model.load()
     run_job(found, loaded, model, output, command="reconstruct", recipe=None, adapter=adapter, files=files)

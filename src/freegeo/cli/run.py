@@ -26,11 +26,11 @@ def run(
     Parameters
     ----------
     sources
-        A folder of photos, a glob in quotes, photo files, or `demo` (a generated room).
+        A folder of photos, a glob in quotes, photo files, a video, or `demo` (a generated room).
     adapt
         Adapt before reconstructing; --no-adapt uses the frozen model.
     """
-    found = load_source(sources, photos.max_views)
+    found = load_source(sources, photos)
     loaded = model.load()
     plan = recipe.build(loaded.spec) if adapt else None
     run_job(found, loaded, model, output, command="run", recipe=plan, files=files)

@@ -1,4 +1,4 @@
-"""What SOURCE may be: a folder of photos, a glob, photo files, or `demo`."""
+"""What SOURCE may be: a folder of photos, a glob, photo files, a video, or `demo`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from freegeo.errors import UserError
 
 if TYPE_CHECKING:
+    from freegeo.cli.options import PhotoOptions
     from freegeo.data.scene import Scene
     from freegeo.types import PhotoLike
 
@@ -17,20 +18,25 @@ DEMO_DOMAIN = "light"
 DEMO_FRAMES = 16
 
 
-def load_source(sources: Sequence[str], max_views: int) -> list[PhotoLike]:
+def load_source(sources: Sequence[str], photos: PhotoOptions) -> list[PhotoLike]:
     """Return the photos of one scene: several files are one scene, in the order given."""
     from freegeo.data.photos import load_photos
+    from freegeo.data.video import is_video, load_video
 
     require_sources(sources)
     if list(sources) == [DEMO]:
-        return list(demo_scene(0, DEMO_DOMAIN).photos)[:max_views]
-    return list(load_photos(sources[0] if len(sources) == 1 else list(sources), max_views))
+        return list(demo_scene(0, DEMO_DOMAIN).photos)[: photos.max_views]
+    if len(sources) == 1 and is_video(sources[0]):
+        return list(load_video(sources[0], fps=photos.fps, max_views=photos.max_views))
+    if photos.fps is not None:
+        raise UserError("--fps is for videos; the source is none.")
+    return list(load_photos(sources[0] if len(sources) == 1 else list(sources), photos.max_views))
 
 
 def require_sources(sources: Sequence[str]) -> None:
     """Raise UserError when a command line names no source, or one twice."""
     if not any(sources):
-        raise UserError("no source given: name a folder of photos, a glob in quotes, photo files, or `demo`.")
+        raise UserError("no source given: name a folder of photos, a glob in quotes, photo files, a video, or `demo`.")
     if len(set(sources)) < len(sources):
         twice = next(source for source in sources if sources.count(source) > 1)
         raise UserError(f"{twice} is given twice. Name each source once.")
@@ -45,8 +51,10 @@ def demo_scene(room: int, domain: str) -> Scene:
 
 
 def split_scenes(sources: Sequence[str]) -> list[list[str]]:
-    """Tell scenes apart: photo files together are one scene, every folder or pattern is one of its own."""
+    """Tell scenes apart: photo files together are one scene, every folder, pattern or video is one of its own."""
+    from freegeo.data.video import is_video
+
     require_sources(sources)
-    if all(Path(source).is_file() for source in sources):
+    if all(Path(source).is_file() and not is_video(source) for source in sources):
         return [list(sources)]
     return [[source] for source in sources]

@@ -1,4 +1,4 @@
-"""The published benchmark's datasets by name, behind one set of functions."""
+"""The datasets of the benchmark by name, behind one set of functions: the published ones and generated rooms."""
 
 from pathlib import Path
 from types import ModuleType
@@ -6,17 +6,20 @@ from types import ModuleType
 import numpy as np
 
 from freegeo.data import eth3d, hiroom, scannetpp, sevenscenes
+from freegeo.data.procedural.splits import SPLITS, RoomSplit
 from freegeo.data.protocol import Protocol, SceneTruth
 from freegeo.data.scene import Scene
 from freegeo.errors import UserError
 
-DATASETS: dict[str, ModuleType] = {
+PUBLISHED: dict[str, ModuleType] = {
     "eth3d": eth3d,
     "7scenes": sevenscenes,
     "scannetpp": scannetpp,
     "hiroom": hiroom,
 }
 """Key, which is also the folder in the unpacked archive, to module."""
+DATASETS: dict[str, ModuleType | RoomSplit] = {**PUBLISHED, **SPLITS}
+"""The same with every split of the generated rooms, such as `procedural-light`."""
 
 
 def protocol(dataset: str) -> Protocol:
@@ -39,7 +42,7 @@ def valid_mask(truth: SceneTruth, index: int, size_hw: tuple[int, int]) -> np.nd
     return _module(truth.dataset).valid_mask(truth, index, size_hw)
 
 
-def _module(dataset: str) -> ModuleType:
+def _module(dataset: str) -> ModuleType | RoomSplit:
     if dataset not in DATASETS:
         raise UserError(f"There is no dataset {dataset!r}; known are {', '.join(DATASETS)}.")
     return DATASETS[dataset]

@@ -139,8 +139,8 @@ def load_masks(folder: Path, names: Sequence[str]) -> list[np.ndarray]:
     missing = [name for name in names if Path(name).stem not in files]
     if missing:
         raise UserError(
-            f"{folder}: {len(missing)} of {len(names)} photos have no mask (first: {missing[0]}). Name each mask as its "
-            "photo, or leave --masks out."
+            f"{folder}: {len(missing)} of {len(names)} photos have no mask (first: {missing[0]}). Name each mask as "
+            "its photo, or leave --masks out."
         )
     masks = []
     for name in names:

@@ -52,16 +52,16 @@ def autocast(device: torch.device, precision: Precision) -> AbstractContextManag
 
 
 def cast_linears(model: ReconstructionModel, precision: Precision) -> None:
-    """Store the encoder's frozen linear and convolution weights in the half precision that autocast rounds them to.
+    """Store the encoder's frozen linear weights in the half precision that autocast rounds them to.
 
     Results under `autocast` stay the same to the bit and the weights take half the room. Norms, LayerScale, tokens,
     trained parameters and everything outside the encoder (the heads) keep float32. Rounding is for good: reload the
-    model for float32 results. Nothing happens for `fp32`.
+    model for float32 results, and run this one under `autocast`. Nothing happens for `fp32`.
     """
     if precision == "fp32":
         return
     for module in encoder(model).modules():
-        if isinstance(module, nn.Linear | nn.Conv2d):
+        if isinstance(module, nn.Linear):
             for parameter in module.parameters(recurse=False):
                 if not parameter.requires_grad:
                     parameter.data = parameter.data.to(_DTYPES[precision])

@@ -1,0 +1,202 @@
+"""The adapters of a benchmark run: trained once per dataset (or scene) and recipe, kept for every epoch.
+
+```
+OUT/adapters/<dataset>/<digest of everything that decides the adapter>/
+        configuration.json   epoch-0/ epoch-1/ ...   finished.json (steps, seconds, parameters)
+```
+
+Variants with equal recipes share an adapter.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from freegeo.adaptation.adapter import Adapter, count_trainable
+from freegeo.adaptation.adapter_files import load_adapter, save_adapter
+from freegeo.adaptation.engine import Engine
+from freegeo.adaptation.images import SceneImages
+from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
+from freegeo.adaptation.trainer import STATE_FILE, Adapted, Progress, adapt
+from freegeo.adaptation.views import schedule
+from freegeo.benchmark.tasks import DAMAGED, Problem, plain, reason_of
+from freegeo.data.datasets import load_scene
+from freegeo.data.scene import Scene
+from freegeo.errors import FreeGeoError, UserError
+from freegeo.models.api import ReconstructionModel
+from freegeo.storage import read_json, write_json
+
+logger = logging.getLogger(__name__)
+
+FOLDER, FINISHED, CONFIGURATION = "adapters", "finished.json", "configuration.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdapterJob:
+    """One adapter: what it is trained on and how."""
+
+    dataset: str
+    scenes: tuple[str, ...]
+    recipe: Recipe
+    seed: int
+    base: Mapping[str, Any]
+    """Model, checkpoint and precision."""
+
+    def configuration(self) -> dict[str, Any]:
+        """Everything that decides the adapter."""
+        return plain({
+            "dataset": self.dataset, "scenes": self.scenes, "recipe": asdict(self.recipe), "seed": self.seed,
+            **self.base,
+        })  # fmt: skip
+
+    @property
+    def digest(self) -> str:
+        """Short name of the configuration; the recipe's own name does not count."""
+        about = self.configuration()
+        about["recipe"].pop("name")
+        return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
+
+    def folder(self, out: Path) -> Path:
+        """Where the adapter lies."""
+        return Path(out) / FOLDER / self.dataset / self.digest
+
+    def is_finished(self, out: Path) -> bool:
+        """Whether it has been trained to the end."""
+        return (self.folder(out) / FINISHED).is_file()
+
+    def steps(self, counts: Sequence[int]) -> int:
+        """Number of optimiser steps on scenes with these numbers of frames."""
+        return len(schedule([count for count in counts if count >= SMALLEST_SCENE], self.recipe, self.seed))
+
+
+def train(
+    job: AdapterJob,
+    model: ReconstructionModel,
+    data: Path,
+    out: Path,
+    engine: Engine,
+    on_step: Callable[[Progress], None] = lambda progress: None,
+) -> list[Problem]:
+    """Train an adapter, or continue, and keep it after every epoch; the model is left as it was.
+
+    Returns the scenes that were left out because they could not be read or have fewer than 3 frames. FreeGeoError
+    when none is left.
+    """
+    if job.is_finished(out):
+        return [Problem(**problem) for problem in read_json(job.folder(out) / FINISHED)["left_out"]]
+    scenes, problems = _usable_scenes(job, model, data)
+    folder = job.folder(out)
+    write_json(folder / CONFIGURATION, job.configuration())
+
+    def keep(epoch: int, adapter: Adapter) -> None:
+        page = {"epoch": epoch, "scenes": [scene.name for scene in scenes], "configuration": job.configuration()}
+        save_adapter(adapter, epoch_folder(job, out, epoch), page)
+
+    reset_peak_memory(engine.device)
+    result = adapt(
+        model, scenes, job.recipe, seed=job.seed, engine=engine, resume_in=folder, on_step=on_step, on_epoch=keep
+    )
+    result.adapter.detach()
+    (folder / STATE_FILE).unlink(missing_ok=True)
+    facts = _facts(result, model, job.recipe, peak_memory_gb(engine.device))
+    write_json(folder / FINISHED, {**facts, "left_out": [asdict(problem) for problem in problems]})
+    return problems
+
+
+def use(job: AdapterJob, model: ReconstructionModel, out: Path, epoch: int | None) -> Adapter:
+    """Put a trained adapter on the model, of one epoch or the last.
+
+    FreeGeoError when it has not been trained; UserError when there was no such epoch.
+    """
+    if not job.is_finished(out):
+        raise FreeGeoError(f"the adapter for {job.dataset} was not trained; see the problem of its adaptation")
+    epochs = trained_epochs(job, out)
+    if epoch is not None and epoch not in epochs:
+        raise UserError(f"--epoch {epoch}: the adapter of {job.dataset} has epochs 0 to {max(epochs)}.")
+    return load_adapter(model, epoch_folder(job, out, max(epochs) if epoch is None else epoch))
+
+
+def epoch_folder(job: AdapterJob, out: Path, epoch: int) -> Path:
+    """Folder of the adapter after one epoch, counted from 0."""
+    return job.folder(out) / f"epoch-{epoch}"
+
+
+def trained_epochs(job: AdapterJob, out: Path) -> list[int]:
+    """The epochs that were kept, ascending."""
+    return sorted(int(path.name.removeprefix("epoch-")) for path in job.folder(out).glob("epoch-*"))
+
+
+def scene_images(model: ReconstructionModel, scene: Scene, recipe: Recipe, name: str) -> SceneImages:
+    """The scene's photos as adaptation reads them, decoded on demand."""
+
+    def load(frames: Sequence[int]) -> Tensor:
+        photos = [scene.photos[frame] for frame in frames]
+        if recipe.squash is None:
+            return model.preprocess(photos).images
+        return torch.cat([_squashed(torch.from_numpy(photo.read()), recipe.squash) for photo in photos])
+
+    return SceneImages(name=name, count=len(scene), load=load)
+
+
+def reset_peak_memory(device: torch.device) -> None:
+    """Start to measure the device's peak memory anew; that of the process on a CPU cannot be reset."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def peak_memory_gb(device: torch.device) -> float:
+    """Peak memory in GB: of the device since `reset_peak_memory` on CUDA, else of the process since it started."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 1e9
+    if sys.platform == "win32":
+        return float("nan")
+    import resource
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+
+
+def _usable_scenes(job: AdapterJob, model: ReconstructionModel, data: Path) -> tuple[list[SceneImages], list[Problem]]:
+    scenes, problems = [], []
+    for name in job.scenes:
+        try:
+            scene = load_scene(data, job.dataset, name)
+            if len(scene) < SMALLEST_SCENE:
+                raise FreeGeoError(f"{len(scene)} frames are too few to adapt to; {SMALLEST_SCENE} are needed")
+            scenes.append(scene_images(model, scene, job.recipe, name))
+        except DAMAGED as error:
+            problems.append(
+                Problem(dataset=job.dataset, scene=name, stage="adapt", what="the scene", reason=reason_of(error))
+            )
+    if not scenes:
+        raise FreeGeoError("no scene is left to adapt to: " + "; ".join(str(problem) for problem in problems))
+    return scenes, problems
+
+
+def _facts(result: Adapted, model: ReconstructionModel, recipe: Recipe, peak_gb: float) -> dict[str, float]:
+    totals = [terms["total"] for terms in result.curve]
+    tenth = max(1, len(totals) // 10)
+    return {
+        "steps": len(totals),
+        "seconds": round(result.seconds, 2),
+        "peak_gb": round(peak_gb, 3),
+        "trainable": count_trainable(model, recipe.rank),
+        "first_loss": sum(totals[:tenth]) / tenth,
+        "last_loss": sum(totals[-tenth:]) / tenth,
+    }
+
+
+def _squashed(pixels: Tensor, side: int) -> Tensor:
+    image = pixels.permute(2, 0, 1)[None].float() / 255
+    return F.interpolate(image, size=(side, side), mode="bilinear", align_corners=False)

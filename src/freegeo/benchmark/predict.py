@@ -1,0 +1,277 @@
+"""First stage: run the model on the frames of every task and store what it says, with the full configuration."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache, partial
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from freegeo.adaptation import recipe as recipes
+from freegeo.adaptation.adapter import Adapter
+from freegeo.adaptation.bank import embed_in_chunks
+from freegeo.adaptation.engine import Engine
+from freegeo.adaptation.recipe import Recipe
+from freegeo.adaptation.trainer import Progress
+from freegeo.benchmark.adapters import AdapterJob, peak_memory_gb, reset_peak_memory, train, use
+from freegeo.benchmark.stored import write_stored
+from freegeo.benchmark.tasks import (
+    MEASURED_FILE,
+    SAMPLE,
+    Problem,
+    Task,
+    choose_frames,
+    finish,
+    is_finished,
+    reason_of,
+    run_each,
+    unique,
+)
+from freegeo.benchmark.variants import Variant, variant
+from freegeo.data.datasets import load_scene, scene_names
+from freegeo.data.procedural.splits import PREFIX
+from freegeo.data.scene import Scene
+from freegeo.models.api import ReconstructionModel
+from freegeo.models.catalog import load_model
+from freegeo.models.precision import Precision, autocast, choose_device, choose_precision
+from freegeo.storage import write_json
+from freegeo.types import Features, Prediction, ViewTokens
+
+AdaptPer = Literal["dataset", "scene"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setup:
+    """What a run is made with; together with a task it decides a prediction."""
+
+    data: Path
+    """Folder of the unpacked datasets; generated rooms are written there when they are first used."""
+    out: Path
+    model: str
+    checkpoint: Path | None = None
+    device: str | None = None
+    precision: Precision | None = None
+    recipe: str = "paper"
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the recipe that are replaced, as in `Recipe.changed`."""
+    adapt_per: AdaptPer = "dataset"
+    adapt_seed: int = 42
+    epoch: int | None = None
+    """Which epoch's adapter predicts; None: the last."""
+    scenes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Scenes of each dataset that a dataset-wise adapter is trained on."""
+    overwrite: bool = False
+
+
+class Predictor:
+    """Carries out adaptations and predictions with one resident model."""
+
+    def __init__(self, setup: Setup):
+        self.setup = setup
+        device = choose_device(setup.device)
+        self.engine = Engine(device=device, precision=choose_precision(setup.precision, device))
+        self._in_place: tuple[str, Adapter] | None = None
+        self._load = lru_cache(maxsize=8)(partial(load_scene, setup.data))
+
+    @cached_property
+    def model(self) -> ReconstructionModel:
+        """The model, loaded on first use."""
+        model = load_model(self.setup.model, checkpoint=self.setup.checkpoint)
+        return model.to(self.engine.device).eval()
+
+    def configuration(self, task: Task) -> dict[str, Any]:
+        """Everything but the task itself that decides its prediction."""
+        job = self.adapter_job(task)
+        per = {"per": self.setup.adapt_per, "epoch": self.setup.epoch}
+        return {**self._base(), "adaptation": None if job is None else {**per, **job.configuration()}}
+
+    def adapter_job(self, task: Task) -> AdapterJob | None:
+        """The adapter that a task needs; None for the frozen model."""
+        kind = variant(task.variant)
+        if not kind.adapted:
+            return None
+        scenes = (task.scene,) if self.setup.adapt_per == "scene" else self.setup.scenes.get(task.dataset, ())
+        recipe = kind.recipe(self.recipe(task.dataset))
+        return AdapterJob(
+            dataset=task.dataset, scenes=tuple(scenes), recipe=recipe, seed=self.setup.adapt_seed, base=self._base()
+        )
+
+    def recipe(self, dataset: str) -> Recipe:
+        """The recipe of a dataset with the changes of the run."""
+        family = "procedural" if dataset.startswith(PREFIX) else dataset
+        return recipes.named(self.setup.recipe, self.model.spec, family).changed(**self.setup.changes)
+
+    def unfinished(self, tasks: Sequence[Task]) -> list[Task]:
+        """The tasks that still have to be predicted; UserError when one was made with other settings."""
+        return [
+            task
+            for task in unique(tasks)
+            if not is_finished(task, self.setup.out, self.configuration(task), overwrite=self.setup.overwrite)
+        ]
+
+    def adapter_jobs(self, tasks: Sequence[Task]) -> list[AdapterJob]:
+        """The adapters that these tasks need, each once."""
+        jobs = [job for task in tasks if (job := self.adapter_job(task)) is not None]
+        return list({job.folder(self.setup.out): job for job in jobs}.values())
+
+    def adapt(self, job: AdapterJob, on_step: Callable[[Progress], None] = lambda progress: None) -> list[Problem]:
+        """Train one adapter; returns the scenes that had to be left out."""
+        self._take_off()
+        return train(job, self.model, self.setup.data, self.setup.out, self.engine, on_step)
+
+    def predict(self, task: Task) -> None:
+        """Carry out one task and store its outcome."""
+        scene: Scene = self._load(task.dataset, task.scene)
+        kind = variant(task.variant)
+        job = self.adapter_job(task)
+        self._put_on(job)
+        reset_peak_memory(self.engine.device)
+        facts: dict[str, Any] = {"adapter": None if job is None else job.digest}
+        if kind.measures == "features":
+            frames, values = self._feature_distance(scene, task)
+            write_json(task.folder(self.setup.out) / MEASURED_FILE, values)
+        else:
+            started = time.perf_counter()
+            frames, prediction = self._prediction(scene, task, kind)
+            facts |= {"seconds": time.perf_counter() - started, "peak_gb": peak_memory_gb(self.engine.device)}
+            write_stored(task, self.setup.out, prediction, frames)
+        finish(task, self.setup.out, self.configuration(task), frames=frames, **facts)
+
+    def noise(self, views: int) -> Tensor:
+        """Images (views, 3, H, W) of noise at the model's size, 4:3."""
+        spec = self.model.spec
+        height, width = (max(1, round(side / spec.patch_size)) * spec.patch_size for side in (
+            spec.default_side * 3 / 4, spec.default_side,
+        ))  # fmt: skip
+        return torch.rand(views, 3, height, width, generator=torch.Generator().manual_seed(0))
+
+    @torch.no_grad()
+    def forward(self, images: Tensor) -> Prediction:
+        """One whole pass over images (S, 3, H, W) with the model as it stands."""
+        with self._arithmetic():
+            tokens = embed_in_chunks(self.model, images, device=self.engine.device)
+            return self.model.decode(self._features(tokens))
+
+    def close(self) -> None:
+        """Leave the model as it was loaded."""
+        self._take_off()
+
+    @torch.no_grad()
+    def _prediction(self, scene: Scene, task: Task, kind: Variant) -> tuple[list[int], Prediction]:
+        if kind.encode_all:
+            sample = choose_frames(task.rule, len(scene), SAMPLE, task.seed)
+            kept = list(range(len(sample)))[::2][: task.views]
+            features = self._features(self._tokens(scene, sample)).select(kept)
+            frames = [sample[position] for position in kept]
+        else:
+            frames = choose_frames(task.rule, len(scene), task.views, task.seed)
+            features = self._features(self._tokens(scene, frames))
+        with self._arithmetic():
+            found = self.model.decode(features)
+        return frames, found.map(lambda tensor: tensor[0].float().cpu())
+
+    @torch.no_grad()
+    def _feature_distance(self, scene: Scene, task: Task) -> tuple[list[int], dict[str, float]]:
+        """Distance of the last layer's patch tokens to those of the frozen model that sees 8 views."""
+        sample = choose_frames(task.rule, len(scene), SAMPLE, task.seed)
+        kept = list(range(len(sample)))[::2][: task.views]
+        layer = self.model.spec.loss_layers[-1]
+        tokens = self._tokens(scene, sample)
+        with self._in_place[1].off() if self._in_place else nullcontext():
+            teacher = self._features(tokens).select(kept).levels[layer][0].float()
+        student = self._features(tokens.select(kept)).levels[layer][0].float()
+        cosine = F.cosine_similarity(student, teacher, dim=-1).mean()
+        values = {"mse": float((student - teacher).square().mean()), "cosine": float(cosine)}
+        return [sample[position] for position in kept], values
+
+    def _tokens(self, scene: Scene, frames: Sequence[int]) -> ViewTokens:
+        images = self.model.preprocess([scene.photos[frame] for frame in frames]).images
+        with self._arithmetic():
+            return embed_in_chunks(self.model, images, device=self.engine.device)
+
+    def _features(self, tokens: ViewTokens) -> Features:
+        with self._arithmetic():
+            return self.model.aggregate(tokens, reference="first")
+
+    def _arithmetic(self):
+        return autocast(self.engine.device, self.engine.precision)
+
+    def _base(self) -> dict[str, Any]:
+        loaded = self.model.loaded_from
+        return {
+            "model": self.setup.model,
+            "checkpoint": loaded.fingerprint if loaded else None,
+            "precision": self.engine.precision,
+        }
+
+    def _put_on(self, job: AdapterJob | None) -> None:
+        """Have exactly the adapter of a job on the model."""
+        wanted = None if job is None else str(job.folder(self.setup.out))
+        if self._in_place is not None and self._in_place[0] == wanted:
+            return
+        self._take_off()
+        if job is not None and wanted is not None:
+            self._in_place = wanted, use(job, self.model, self.setup.out, self.setup.epoch)
+
+    def _take_off(self) -> None:
+        if self._in_place is not None:
+            self._in_place[1].detach()
+            self._in_place = None
+
+
+def predict_all(
+    predictor: Predictor,
+    tasks: Sequence[Task],
+    *,
+    on_step: Callable[[AdapterJob, Progress], None] = lambda job, progress: None,
+    on_task: Callable[[Task], None] = lambda task: None,
+) -> list[Problem]:
+    """Train the adapters that unfinished tasks need, then predict these tasks; returns what failed.
+
+    UserError, before anything is computed, when a stored task was made with other settings.
+    """
+    waiting = predictor.unfinished(tasks)
+    problems = run_each(
+        predictor.adapter_jobs(waiting),
+        lambda job: predictor.adapt(job, partial(on_step, job)),
+        lambda job, error: Problem(
+            dataset=job.dataset, scene=_joined(job.scenes), stage="adapt", what=job.digest, reason=reason_of(error)
+        ),
+    )
+    # One adapter after the other, and within it scene by scene, so that both are loaded once.
+    ordered = sorted(waiting, key=lambda task: (task.dataset, _adapter_of(predictor, task)))
+    problems += run_each(ordered, predictor.predict, problem_of("predict"), on_task)
+    predictor.close()
+    return problems
+
+
+def problem_of(stage: Literal["predict", "evaluate"]) -> Callable[[Task, BaseException], Problem]:
+    """How a failed task of a stage becomes a problem."""
+
+    def explain(task: Task, error: BaseException) -> Problem:
+        what = f"{task.views} views, seed {task.seed}, {task.variant}"
+        return Problem(dataset=task.dataset, scene=task.scene, stage=stage, what=what, reason=reason_of(error))
+
+    return explain
+
+
+def listed_scenes(data: Path, dataset: str, limit: int | None) -> tuple[str, ...]:
+    """The scenes of a dataset, at most `limit` of them."""
+    names = scene_names(data, dataset)
+    return tuple(names if limit is None else names[:limit])
+
+
+def _adapter_of(predictor: Predictor, task: Task) -> str:
+    job = predictor.adapter_job(task)
+    return "" if job is None else str(job.folder(predictor.setup.out))
+
+
+def _joined(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) <= 3 else f"{names[0]} and {len(names) - 1} more"

@@ -1,0 +1,200 @@
+"""The units of a benchmark run: what a task is, where its files lie, and what happens when one fails.
+
+```
+OUT/predictions/<dataset>/<scene>/<rule>-<views>v-seed<seed>/<variant>/
+        task.json        the task with its full configuration, written last: a task without it is not finished
+        prediction.npz   depth_z, T_cam_world, K, frames       (or measured.json, see `freegeo.benchmark.predict`)
+        scores.json      metrics of the second stage
+```
+
+A task depends on no other one, so a run may be stopped anywhere, continued, or spread over machines.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import struct
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
+
+import torch
+
+from freegeo.benchmark import sampling
+from freegeo.errors import FreeGeoError, UserError
+from freegeo.storage import read_json, write_json
+
+logger = logging.getLogger(__name__)
+
+FrameRule = Literal["da3", "vggt", "experiment", "neighbours"]
+Item = TypeVar("Item")
+FRAME_RULES: tuple[FrameRule, ...] = get_args(FrameRule)
+PREDICTIONS, TASK_FILE, PREDICTION_FILE, MEASURED_FILE, SCORES_FILE = (
+    "predictions", "task.json", "prediction.npz", "measured.json", "scores.json",
+)  # fmt: skip
+SAMPLE = 8
+"""Views of the sample that "8->4", and 4 views of the rules `vggt`, `experiment` and `neighbours`, are taken from."""
+DAMAGED = (
+    FreeGeoError, OSError, ValueError, LookupError, EOFError, SyntaxError, ArithmeticError, struct.error, zlib.error,
+    torch.linalg.LinAlgError, torch.OutOfMemoryError,
+)  # fmt: skip
+"""What reading damaged data, a full disk or a scene too large for the memory raises; the other scenes go on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """One prediction: a scene, which of its frames, and which variant of the model."""
+
+    dataset: str
+    scene: str
+    rule: FrameRule
+    views: int
+    seed: int
+    """Of the frames."""
+    variant: str
+
+    def folder(self, out: Path) -> Path:
+        """Where everything about the task lies."""
+        sample = f"{self.rule}-{self.views}v-seed{self.seed}"
+        return Path(out) / PREDICTIONS / self.dataset / self.scene.replace("/", "-") / sample / self.variant
+
+    def __str__(self) -> str:
+        """Name the task for people."""
+        return f"{self.dataset} {self.scene}, {self.views} views, seed {self.seed}, {self.variant}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """Why something of a scene could not be computed."""
+
+    dataset: str
+    scene: str
+    stage: Literal["adapt", "predict", "evaluate"]
+    what: str
+    reason: str
+
+    def __str__(self) -> str:
+        """Name scene and reason in one sentence."""
+        return f"{self.dataset} {self.scene}: {self.stage} of {self.what}: {self.reason}"
+
+
+def choose_frames(rule: FrameRule, num_frames: int, views: int, seed: int) -> list[int]:
+    """Frames of a task, ascending, by the rule of one of the published runners.
+
+    `da3`: the first entries of a seeded shuffle; sets of one seed are nested. `vggt`: the same, but fewer than 8 views
+    are every second frame of the 8. `experiment`: the sample of the published "8->4" comparison, fewer than 8 views
+    likewise. `neighbours` (ours): 8 frames in a row from a seeded start,
+    fewer than 8 are every second of them; more than 8 are a longer row.
+
+    Source: benchmark protocol, section 2.
+    """
+    if rule == "da3":
+        return sampling.standard_frames(num_frames, views, seed)
+    if rule == "vggt":
+        if views < SAMPLE:
+            return sampling.every_second_frame(num_frames, SAMPLE, views, seed)
+        return sampling.standard_frames(num_frames, views, seed)
+    if rule not in FRAME_RULES:
+        raise UserError(f"There is no frame rule {rule!r}; choose one of {', '.join(FRAME_RULES)}.")
+    sample = max(views, SAMPLE)
+    if rule == "experiment":
+        frames = sampling.experiment_frames(num_frames, sample, seed)
+    else:
+        start = seed % max(1, num_frames - sample + 1)
+        frames = list(range(start, min(num_frames, start + sample)))
+    return frames if views >= len(frames) else frames[::2][:views]
+
+
+def plain(value: Any) -> Any:
+    """The value as it comes back from a JSON file: tuples become lists, keys text."""
+    return json.loads(json.dumps(value))
+
+
+def differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """Names of the settings in which two configurations differ, dotted, with both values."""
+    found = []
+    for name in sorted(set(before) | set(now)):
+        old, new = before.get(name), now.get(name)
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            found += differences(old, new, f"{prefix}{name}.")
+        elif old != new:
+            found.append(f"{prefix}{name}: {_short(old)} there, {_short(new)} now")
+    return found
+
+
+def is_finished(task: Task, out: Path, configuration: Mapping[str, Any], *, overwrite: bool = False) -> bool:
+    """Whether the task's prediction is there, made with this configuration.
+
+    UserError names the setting when it was made with another one, unless `overwrite` allows to replace it.
+    """
+    path = task.folder(out) / TASK_FILE
+    if not path.is_file():
+        return False
+    unequal = differences(read_json(path)["configuration"], plain(configuration))
+    if unequal and not overwrite:
+        raise UserError(
+            f"{path.parent}: was predicted with other settings ({'; '.join(unequal)}). Choose another output folder, "
+            "or replace it with --overwrite."
+        )
+    return not unequal
+
+
+def finish(task: Task, out: Path, configuration: Mapping[str, Any], **facts: Any) -> None:
+    """Mark a task as done; older scores of it are dropped."""
+    folder = task.folder(out)
+    (folder / SCORES_FILE).unlink(missing_ok=True)
+    write_json(folder / TASK_FILE, {"task": asdict(task), "configuration": plain(configuration), **facts})
+
+
+def stored_tasks(out: Path) -> list[tuple[Task, dict[str, Any]]]:
+    """All finished tasks of a folder with the content of task.json, in the order of their folders."""
+    records = [read_json(path) for path in sorted((Path(out) / PREDICTIONS).glob(f"*/*/*/*/{TASK_FILE}"))]
+    return [(Task(**record["task"]), record) for record in records]
+
+
+def run_each(
+    items: Iterable[Item],
+    work: Callable[[Item], Iterable[Problem] | None],
+    explain: Callable[[Item, BaseException], Problem],
+    on_done: Callable[[Item], None] = lambda item: None,
+) -> list[Problem]:
+    """Do the work for every item; an item that fails on its data becomes a problem and the others go on."""
+    problems: list[Problem] = []
+    for item in items:
+        try:
+            problems += work(item) or ()
+        except DAMAGED as error:
+            logger.debug("failed on %s", item, exc_info=True)
+            problems.append(explain(item, error))
+        on_done(item)
+    return problems
+
+
+def reason_of(error: BaseException) -> str:
+    """One line that says what went wrong."""
+    if isinstance(error, FreeGeoError):
+        return str(error)
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.strerror}{f': {error.filename}' if error.filename else ''}"
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def by_scene(tasks: Iterable[Task]) -> dict[tuple[str, str], list[Task]]:
+    """Group tasks by dataset and scene, keeping their order."""
+    groups: dict[tuple[str, str], list[Task]] = {}
+    for task in tasks:
+        groups.setdefault((task.dataset, task.scene), []).append(task)
+    return groups
+
+
+def unique(items: Sequence[Item]) -> list[Item]:
+    """The items without repeats, in their first order."""
+    return list(dict.fromkeys(items))
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

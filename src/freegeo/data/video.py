@@ -1,0 +1,266 @@
+"""A user's video as photos: frames that are sharp and far enough apart, upright, decoded again when they are read.
+
+Two passes over the file. The first looks at every frame in small and keeps one candidate per time slot, at most
+`MAX_CANDIDATES` of them however long the video is. The choice is made among the candidates. The pixels of a chosen
+frame are decoded when they are asked for, so memory does not grow with length or resolution.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from freegeo.errors import FreeGeoError, UserError
+
+logger = logging.getLogger(__name__)
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".3gp"})
+MAX_CANDIDATES = 2048
+SMALLEST_CHANGE = 0.05
+"""Mean absolute difference, in standard deviations of the image, below which two frames count as one view."""
+_SHARPNESS_WIDTH, _THUMBNAIL_HW = 320, (36, 48)
+_FIRST_SLOT_S = 1 / 30
+_FALLBACK_RATE = 30.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoFrame:
+    """One chosen frame; usable wherever a photo is."""
+
+    name: str
+    """Name of the video and number of the frame, with the suffix `.png`."""
+    path: Path
+    size_hw: tuple[int, int]
+    """Height and width after rotation."""
+    time_s: float
+    """Seconds since the first frame."""
+    number: int
+    """Position among the decodable frames of the file."""
+    pts: int | None
+    """Timestamp as stored; None where the file has none."""
+
+    def read(self) -> np.ndarray:
+        """Decode to upright RGB (H, W, 3) uint8. FreeGeoError when the file has changed since."""
+        for seek in (True, False) if self.pts is not None else (False,):
+            with _opened(self.path) as container:
+                frame = self._find(container, seek)
+                if frame is not None:
+                    return _upright(frame.to_ndarray(format="rgb24"), frame.rotation)
+        raise FreeGeoError(f"{self.path}: frame {self.number} is no longer there. Was the video replaced?")
+
+    def _find(self, container: Any, seek: bool) -> Any:
+        stream = container.streams.video[0]
+        if seek:
+            container.seek(self.pts, stream=stream)
+        for number, frame in enumerate(_decoded(container, self.path)):
+            if seek and frame.pts is not None and frame.pts >= self.pts:
+                # An index that leads past the frame is answered by decoding from the start.
+                return frame if frame.pts == self.pts else None
+            if not seek and number == self.number:
+                return frame
+        return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """What the choice of frames knows of one frame."""
+
+    number: int
+    pts: int | None
+    time_s: float
+    size_hw: tuple[int, int]
+    sharpness: float
+    """Variance of the Laplacian of the frame at 320 pixels width; compared between neighbours only."""
+    thumbnail: np.ndarray
+    """(36, 48) float16 grey values with mean 0 and standard deviation 1, so that exposure does not count as motion."""
+
+
+def is_video(path: Path | str) -> bool:
+    """Whether a path is named like a video."""
+    return Path(path).suffix.lower() in VIDEO_SUFFIXES
+
+
+def load_video(path: Path | str, *, fps: float | None = None, max_views: int) -> list[VideoFrame]:
+    """Choose frames of a video, in order of time.
+
+    Args:
+        path: of a file that FFmpeg reads.
+        fps: frames per second of the video's own clock: the sharpest frame of each interval, evenly thinned to
+            `max_views`. None chooses by parallax: steps of about the same image change, so a camera that rests gives
+            one frame, and the sharpest frame around each step.
+        max_views: most frames to return.
+
+    Returns:
+        At least one frame. Variable frame rates are followed by the timestamps. Of a damaged file, what can be decoded.
+
+    Raises:
+        UserError: no such file, not a video, a video without frames, or `fps` or `max_views` out of range.
+    """
+    path = Path(path)
+    if max_views < 1:
+        raise UserError(f"--max-views must be at least 1, got {max_views}.")
+    if fps is not None and not 0 < fps < float("inf"):
+        raise UserError(f"--fps must be a positive number, got {fps}.")
+    if not path.is_file():
+        raise UserError(f"{path}: no such video.")
+    found = collect_candidates(path, slot_s=_FIRST_SLOT_S if fps is None else 1 / fps)
+    if not found:
+        raise UserError(f"{path}: the video has no frame that can be decoded. Record or convert it again.")
+    chosen = choose_by_time(found, max_views) if fps is not None else choose_by_parallax(found, max_views)
+    logger.info("%s: %d of %d candidate frames chosen", path.name, len(chosen), len(found))
+    digits = max(6, len(str(found[-1].number)))
+    return [
+        VideoFrame(
+            name=f"{path.stem}_{c.number:0{digits}d}.png",
+            path=path,
+            size_hw=c.size_hw,
+            time_s=c.time_s,
+            number=c.number,
+            pts=c.pts,
+        )
+        for c in chosen
+    ]
+
+
+def collect_candidates(path: Path, *, slot_s: float) -> list[Candidate]:
+    """Return the sharpest frame of every time slot, in order of time.
+
+    Slots start at `slot_s` seconds and are doubled whenever more than `MAX_CANDIDATES` are filled.
+    """
+    best: dict[int, Candidate] = {}
+    with _opened(path) as container:
+        for candidate in _looked_at(container, path):
+            _keep_sharper(best, candidate, slot_s)
+            if len(best) > MAX_CANDIDATES:
+                slot_s *= 2
+                merged: dict[int, Candidate] = {}
+                for kept in best.values():
+                    _keep_sharper(merged, kept, slot_s)
+                best = merged
+    return sorted(best.values(), key=lambda c: (c.time_s, c.number))
+
+
+def _keep_sharper(best: dict[int, Candidate], candidate: Candidate, slot_s: float) -> None:
+    # Timestamps carry the rounding of their time base, which must not tip a frame into the slot before its own.
+    slot = int(candidate.time_s / slot_s + 1e-3)
+    if slot not in best or candidate.sharpness > best[slot].sharpness:
+        best[slot] = candidate
+
+
+def choose_by_time(candidates: Sequence[Candidate], max_views: int) -> list[Candidate]:
+    """Thin candidates evenly to at most `max_views`, first and last included (the first alone for one view)."""
+    places = np.linspace(0, len(candidates) - 1, min(len(candidates), max_views))
+    return [candidates[round(place)] for place in places]
+
+
+def choose_by_parallax(candidates: Sequence[Candidate], max_views: int) -> list[Candidate]:
+    """Choose candidates at even steps of image change, and around each step the sharpest.
+
+    The way is measured over frames that differ from the last one measured by more than `SMALLEST_CHANGE`, so noise of a
+    resting camera adds nothing. Up to half way to its neighbours, the sharpest frame stands for each step.
+    """
+    moved, way = _way(np.stack([c.thumbnail for c in candidates]).astype(np.float32).reshape(len(candidates), -1))
+    marks = np.linspace(0, way[-1], min(len(moved), max_views))
+    steps = sorted({int(moved[np.abs(way - mark).argmin()]) for mark in marks})
+    borders = [0, *((a + b + 1) // 2 for a, b in pairwise(steps)), len(candidates)]
+    return [max(candidates[start:end], key=lambda c: c.sharpness) for start, end in pairwise(borders)]
+
+
+def _way(thumbnails: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (n,) of the frames that moved on, the first included, and the summed change (n,) up to each."""
+    moved, way = [0], [0.0]
+    for k in range(1, len(thumbnails)):
+        change = float(np.abs(thumbnails[k] - thumbnails[moved[-1]]).mean())
+        if change > SMALLEST_CHANGE:
+            moved.append(k)
+            way.append(way[-1] + change)
+    return np.array(moved), np.array(way)
+
+
+def _looked_at(container: Any, path: Path) -> Iterator[Candidate]:
+    stream = container.streams.video[0]
+    stream.thread_type = "AUTO"
+    rate = float(stream.average_rate or _FALLBACK_RATE)
+    start = None
+    for number, frame in enumerate(_decoded(container, path)):
+        time_s = frame.time if frame.time is not None else number / rate
+        start = time_s if start is None else start
+        grey = _grey(frame)
+        yield Candidate(
+            number=number,
+            pts=frame.pts,
+            time_s=max(0.0, time_s - start),
+            size_hw=_turned((frame.height, frame.width), frame.rotation),
+            sharpness=sharpness(grey),
+            thumbnail=_thumbnail(grey),
+        )
+
+
+def sharpness(grey: np.ndarray) -> float:
+    """Variance of the Laplacian of an image (H, W); 0 for images without an interior."""
+    if min(grey.shape) < 3:
+        return 0.0
+    values = grey.astype(np.float32)
+    laplacian = values[:-2, 1:-1] + values[2:, 1:-1] + values[1:-1, :-2] + values[1:-1, 2:] - 4 * values[1:-1, 1:-1]
+    return float(laplacian.var())
+
+
+def _grey(frame: Any) -> np.ndarray:
+    """Luminance (h, w) uint8 at no more than 320 pixels width."""
+    width = min(frame.width, _SHARPNESS_WIDTH)
+    height = max(1, round(frame.height * width / frame.width))
+    return frame.reformat(width=width, height=height, format="gray").to_ndarray()
+
+
+def _thumbnail(grey: np.ndarray) -> np.ndarray:
+    from PIL import Image
+
+    small = np.asarray(Image.fromarray(grey).resize(_THUMBNAIL_HW[::-1], Image.Resampling.BOX), dtype=np.float32)
+    return ((small - small.mean()) / max(float(small.std()), 1.0)).astype(np.float16)
+
+
+def _turned(size_hw: tuple[int, int], rotation: int) -> tuple[int, int]:
+    return size_hw[::-1] if _quarter_turns(rotation) % 2 else size_hw
+
+
+def _upright(image: np.ndarray, rotation: int) -> np.ndarray:
+    """Turn pixels as the rotation metadata asks; angles that are no quarter turn are rounded to one."""
+    return np.ascontiguousarray(np.rot90(image, _quarter_turns(rotation)))
+
+
+def _quarter_turns(rotation: int) -> int:
+    """Counter-clockwise quarter turns of a rotation in degrees."""
+    return round(rotation / 90) % 4
+
+
+def _decoded(container: Any, path: Path) -> Iterator[Any]:
+    """Frames of the first video stream; a file that breaks off ends the iteration with a warning."""
+    from av.error import FFmpegError
+
+    try:
+        yield from container.decode(container.streams.video[0])
+    except (FFmpegError, EOFError) as error:
+        logger.warning("%s: damaged or truncated (%s); what was decoded before that is used.", path, error)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    import av
+    from av.error import FFmpegError
+
+    try:
+        container = av.open(str(path))
+    except (FFmpegError, OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{path}: not a readable video ({reason}). Convert it, or give a folder of photos.") from None
+    with container:
+        if not container.streams.video:
+            raise UserError(f"{path}: holds no video stream. Give a video, or a folder of photos.")
+        yield container

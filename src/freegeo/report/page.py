@@ -1,0 +1,266 @@
+"""``report.html``: one page, in one file without links to anything, that shows what a run did."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from freegeo import storage
+from freegeo.export.reconstruction import Reconstruction
+from freegeo.report import figures
+from freegeo.report.result import LABELS, Result, camera_difference, load_result
+from freegeo.report.scene3d import ERROR_LIMIT, MAX_KEPT, scene_data
+
+FILE_NAME = "report.html"
+TEMPLATE = "report.html.j2"
+Range = tuple[float, float]
+CHANGE_LIMIT = 0.2
+"""Relative depth change that has the last colour."""
+MANY_VIEWS, NARROW_WIDTH = 16, 224
+"""Beyond so many views pictures are narrower."""
+SCORE_LABELS = {
+    "auc03": "AUC@3°", "auc05": "AUC@5°", "auc15": "AUC@15°", "auc30": "AUC@30°", "abs_rel": "depth error (abs-rel)",
+    "f1_rel5": "F1 of points",
+}  # fmt: skip
+FILTER_TEXTS = {
+    "invalid depth": "no usable depth",
+    "mask": "outside the user's masks",
+    "sky": "sky",
+    "confidence": "least confident share",
+    "flying": "between surfaces (flying pixels)",
+    "multi-view": "contradicted by other views",
+}
+
+
+def write_report(folder: Path, *, truth: Reconstruction | None = None) -> Path:
+    """Write `report.html` of a finished output folder.
+
+    Args:
+        folder: holds prediction.npz and, where there, reconstruction.json, frozen/, adapter/ and scores.json.
+        truth: ground truth at the prediction's resolution, in any world frame; default: `truth/prediction.npz` of the
+            folder, if there.
+
+    Raises:
+        UserError: no reconstruction there, or one of a newer format.
+        FreeGeoError: a damaged file, or ground truth of another size.
+    """
+    result = load_result(Path(folder), truth=truth)
+    path = result.folder / FILE_NAME
+    with storage.atomic_path(path) as part:
+        part.write_text(render(result), encoding="utf-8")
+    return path
+
+
+def render(result: Result) -> str:
+    """The page as text; everything that is not ours is escaped by the template engine."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(
+        loader=PackageLoader("freegeo.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True,
+    )  # fmt: skip
+    curve = result.adaptation.get("loss_curve") or []
+    return environment.get_template(TEMPLATE).render(
+        title=result.folder.resolve().name,
+        facts=facts(result),
+        stages=[{"key": s.key, "label": s.label} for s in result.stages.values()],
+        predictions=[{"key": s.key, "label": s.label} for s in result.predictions],
+        scene=scene_data(result) if result.has_cameras else None,
+        most_points=MAX_KEPT,
+        has_error=result.truth is not None,
+        views=views(result),
+        legends=legends(result),
+        names=list(result.names),
+        plan=Markup(figures.camera_plan(result)) if result.has_cameras else None,
+        cameras=camera_rows(result),
+        loss=Markup(figures.loss_curve(curve)) if curve else None,
+        steps=len(curve),
+        loss_change=result.summary.get("loss"),
+        truth_rows=truth_rows(result),
+        scores=score_table(result.scores),
+        filters=filter_tables(result),
+        seconds=list((result.summary.get("seconds") or {}).items()),
+        settings=list(flattened(result.summary.get("settings") or {})),
+        adaptation=list(flattened({k: v for k, v in result.adaptation.items() if k not in ("loss_curve", "recipe")})),
+        versions=list((result.summary.get("versions") or {}).items()),
+        licence=result.summary.get("licence_of_weights"),
+        command=result.summary.get("command"),
+        files=[name for name in FILES if (result.folder / name).exists()],
+    )
+
+
+FILES = (
+    "points.ply", "scene.glb", "mesh.ply", "colmap", "transforms.json", "depth", "prediction.npz",
+    "frozen/prediction.npz", "adapter", "reconstruction.json",
+)  # fmt: skip
+
+
+def facts(result: Result) -> list[tuple[str, str]]:
+    """The few things to know first."""
+    summary, final = result.summary, result.final
+    height, width = final.depth_z.shape[1:]
+    found = [
+        ("model", str(summary.get("model", "unknown"))),
+        ("views", str(len(result.names))),
+        ("resolution", f"{width} × {height}"),
+        ("kept pixels", f"{_percent(final.keep.mean())} of {final.keep.size:,}"),
+    ]
+    if summary.get("loss"):
+        found.append(("loss", f"{summary['loss']['first']:.4f} → {summary['loss']['last']:.4f}"))
+    if summary.get("seconds"):
+        found.append(("time", _duration(sum(summary["seconds"].values()))))
+    return found
+
+
+def views(result: Result) -> Iterator[dict[str, Any]]:
+    """One entry per photo: its name and its pictures, each (class, caption, data URI)."""
+    width = figures.MAX_WIDTH if len(result.names) <= MANY_VIEWS else NARROW_WIDTH
+    depth_range, conf_range = map_ranges(result)
+    for view, name in enumerate(result.names):
+        pictures = [("photo", "photo", result.images[view]), *_maps(result, view, depth_range, conf_range)]
+        yield {
+            "name": name,
+            "pictures": [(kind, caption, figures.data_uri(image, width)) for kind, caption, image in pictures],
+        }
+
+
+def _maps(result: Result, view: int, depth_range: Range, conf_range: Range) -> Iterator[tuple[str, str, np.ndarray]]:
+    """The colour-coded maps of a view: CSS classes, caption, image."""
+    for stage in result.stages.values():
+        depth = figures.log_colours(stage.depth_z[view], depth_range, figures.DEPTH_MAP)
+        yield f"depth {stage.key}", f"depth, {stage.label}", depth
+    if len(result.predictions) == 2:
+        before, after = (stage.depth_z[view] for stage in result.predictions)
+        yield "depth", "change of depth", change_map(before, after)
+    for stage in result.predictions:
+        if stage.error is not None:
+            error = figures.linear_colours(stage.error[view], (0, ERROR_LIMIT), figures.ERROR_MAP)
+            yield f"error {stage.key}", f"depth error, {stage.label}", error
+    for stage in result.predictions:
+        conf = figures.log_colours(stage.conf[view], conf_range, figures.CONF_MAP)
+        yield f"confidence {stage.key}", f"confidence, {stage.label}", conf
+
+
+def map_ranges(result: Result) -> tuple[Range, Range]:
+    """Ranges of depth and confidence that all views and stages share."""
+    depth = figures.log_range([stage.depth_z for stage in result.stages.values()])
+    return depth, figures.log_range([stage.conf for stage in result.predictions])
+
+
+def change_map(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Colours (H, W, 3) of the relative change of depth: red farther, blue nearer, white unchanged."""
+    usable = np.isfinite(before) & np.isfinite(after) & (before > 0)
+    change = np.divide(after, before, out=np.full(before.shape, np.nan, dtype=np.float32), where=usable) - 1
+    return figures.linear_colours(change, (-CHANGE_LIMIT, CHANGE_LIMIT), figures.CHANGE_MAP)
+
+
+def legends(result: Result) -> list[dict[str, str]]:
+    """Colour scales: name, ends and gradient."""
+    depth_range, conf_range = map_ranges(result)
+    found = [_legend("depth", f"{depth_range[0]:.3g}", f"{depth_range[1]:.3g}", figures.DEPTH_MAP)]
+    found.append(_legend("confidence", f"{conf_range[0]:.3g}", f"{conf_range[1]:.3g}", figures.CONF_MAP))
+    if len(result.predictions) == 2:
+        limit = _percent(CHANGE_LIMIT, 0)
+        found.append(_legend("change", f"{limit} nearer", f"{limit} farther", figures.CHANGE_MAP))
+    if result.truth is not None:
+        found.append(_legend("error", "0", f"{_percent(ERROR_LIMIT, 0)} or more", figures.ERROR_MAP))
+    return found
+
+
+def _legend(name: str, low: str, high: str, colours: str) -> dict[str, str]:
+    return {
+        "name": name,
+        "map": "depth" if name == "change" else name,
+        "low": low,
+        "high": high,
+        "gradient": figures.gradient(colours),
+    }
+
+
+def camera_rows(result: Result) -> list[tuple[str, str, str]]:
+    """How far the cameras of two stages lie apart: what, median angle, median distance."""
+    if not result.has_cameras:
+        return []
+    pairs = [(s, result.truth, f"{s.label}, from ground truth") for s in result.predictions if result.truth]
+    if not pairs and len(result.predictions) == 2:
+        pairs = [(result.predictions[1], result.predictions[0], "adapted, from frozen")]
+    rows = []
+    for stage, reference, name in pairs:
+        assert reference is not None
+        angle, distance = camera_difference(stage, reference)
+        rows.append((name, f"{np.median(angle):.2f}°", f"{np.median(distance):.3g}"))
+    return rows
+
+
+def truth_rows(result: Result) -> list[tuple[str, str, str]]:
+    """Depth against ground truth per model: name, mean relative error, share within 25 %."""
+    rows = []
+    for stage in result.predictions:
+        if stage.error is None or result.truth is None or not np.isfinite(stage.error).any():
+            continue
+        valid = np.isfinite(stage.error)
+        ratio = stage.depth_z[valid] / result.truth.depth_z[valid]
+        inside = np.maximum(ratio, 1 / ratio) < 1.25
+        rows.append((stage.label, f"{stage.error[valid].mean():.3f}", _percent(inside.mean())))
+    return rows
+
+
+def score_table(scores: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The scores that `freegeo demo` stored, as header and rows; None when there are none."""
+    try:
+        counts = list(next(iter(scores.values())))
+        keys = [key for key in SCORE_LABELS if key in scores["frozen"][counts[0]]]
+        rows = [
+            (count, LABELS[stage], *(f"{scores[stage][count][key]:.3f}" for key in keys))
+            for count in counts
+            for stage in ("frozen", "adapted")
+        ]
+    except (StopIteration, KeyError, IndexError, TypeError, AttributeError):
+        return None
+    return {"header": ("views", "model", *(SCORE_LABELS[key] for key in keys)), "rows": rows}
+
+
+def filter_tables(result: Result) -> list[dict[str, Any]]:
+    """What the filters took, per model; of the exported one, what the run itself noted down."""
+    noted = result.summary.get("filters")
+    tables = []
+    for stage in result.predictions:
+        removed, pixels = stage.removed, stage.keep.size
+        if stage is result.final and noted:
+            removed, pixels = noted["removed"], noted["pixels"]
+        if removed:
+            tables.append(_filter_table(stage.label, removed, pixels))
+    return tables
+
+
+def _filter_table(label: str, removed: Mapping[str, int], pixels: int) -> dict[str, Any]:
+    rows = [(FILTER_TEXTS.get(name, name), f"{count:,}", _percent(count / pixels)) for name, count in removed.items()]
+    kept = pixels - sum(removed.values())
+    return {"label": label, "rows": rows, "kept": (f"{kept:,}", _percent(kept / pixels))}
+
+
+def flattened(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Nested settings as (dotted name, text); lists are joined, long ones counted."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from flattened(value, f"{prefix}{name}.")
+        elif isinstance(value, list) and len(value) > 8:
+            yield f"{prefix}{name}", f"{len(value)} entries"
+        elif isinstance(value, list):
+            yield f"{prefix}{name}", ", ".join(str(item) for item in value)
+        else:
+            yield f"{prefix}{name}", "–" if value is None else str(value)
+
+
+def _percent(share: float, digits: int = 1) -> str:
+    return f"{100 * float(share):.{digits}f} %"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

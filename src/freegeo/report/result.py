@@ -1,0 +1,246 @@
+"""What an output folder holds, brought into one frame and scale so that it can be shown together.
+
+A model before and after adaptation gives two reconstructions, each with its own world frame and scale. With ground
+truth both are moved onto it, otherwise the one before onto the one after.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from freegeo.errors import FreeGeoError, UserError
+from freegeo.export.formats import filter_reconstruction
+from freegeo.export.reconstruction import FILE_NAME, Reconstruction
+from freegeo.geometry.depth import depth_to_world, valid_depth
+from freegeo.geometry.se3 import camera_centres
+from freegeo.geometry.sim3 import Sim3
+from freegeo.storage import FORMAT, read_json
+
+SUMMARY_NAME, SCORES_NAME = "reconstruction.json", "scores.json"
+FROZEN_FOLDER, TRUTH_FOLDER, ADAPTER_PAGE = "frozen", "truth", "adapter/freegeo.json"
+LABELS = {"frozen": "frozen", "adapted": "adapted", "truth": "ground truth"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """One reconstruction in the common frame and scale."""
+
+    key: str
+    """`frozen`, `adapted` or `truth`."""
+    depth_z: np.ndarray
+    """(S, H, W) float32."""
+    conf: np.ndarray
+    """(S, H, W) float32."""
+    T_cam_world: np.ndarray | None
+    """(S, 4, 4) float32."""
+    K: np.ndarray | None
+    """(S, 3, 3) float32."""
+    keep: np.ndarray
+    """(S, H, W) bool: what the export's filters keep; all valid depth of ground truth or without cameras."""
+    removed: Mapping[str, int]
+    """Pixels taken by each filter; empty where none ran."""
+    error: np.ndarray | None = None
+    """(S, H, W) float32 |d - d_true| / d_true, NaN where one of them is not valid; None without ground truth."""
+
+    @property
+    def label(self) -> str:
+        """The name for people."""
+        return LABELS[self.key]
+
+    def world_points(self) -> np.ndarray:
+        """World points (S, H, W, 3) float32; UserError without cameras."""
+        if self.T_cam_world is None or self.K is None:
+            raise UserError("This reconstruction has no cameras, so it has no 3D points.")
+        depth_z, K, T_cam_world = (torch.from_numpy(a) for a in (self.depth_z, self.K, self.T_cam_world))
+        return depth_to_world(depth_z, K, T_cam_world).numpy()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """One output folder."""
+
+    folder: Path
+    summary: Mapping[str, Any]
+    """Content of reconstruction.json; empty when the folder has none."""
+    adaptation: Mapping[str, Any]
+    """Content of adapter/freegeo.json; empty without adaptation."""
+    scores: Mapping[str, Any]
+    """Content of scores.json; empty when there is none."""
+    stages: Mapping[str, Stage]
+    """In the order frozen, adapted, truth, those there are."""
+    names: Sequence[str]
+    images: np.ndarray
+    """(S, H, W, 3) uint8, what the model read."""
+    from_own_frame: Sim3 | None
+    """From the world frame of the folder's files to the common one; None without cameras."""
+
+    @property
+    def predictions(self) -> list[Stage]:
+        """The stages that a model made."""
+        return [stage for stage in self.stages.values() if stage.key != "truth"]
+
+    @property
+    def final(self) -> Stage:
+        """What the exported files show: adapted where there is an adapter."""
+        return self.predictions[-1]
+
+    @property
+    def truth(self) -> Stage | None:
+        """Ground truth."""
+        return self.stages.get("truth")
+
+    @property
+    def has_cameras(self) -> bool:
+        """Whether there is anything to show in 3D."""
+        return self.final.T_cam_world is not None
+
+
+def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
+    """Read an output folder.
+
+    Args:
+        folder: as `freegeo run`, `reconstruct` and `demo` write it.
+        truth: ground truth at the prediction's resolution; default: `truth/prediction.npz` of the folder, if there.
+
+    Raises:
+        UserError: no reconstruction there, or one of a newer format.
+        FreeGeoError: a damaged file, or ground truth of another size.
+    """
+    folder = Path(folder)
+    if not (folder / FILE_NAME).is_file():
+        raise UserError(f"{folder}: holds no reconstruction ({FILE_NAME} is missing). Name the output folder of a run.")
+    summary = _mapping(folder / SUMMARY_NAME)
+    if summary.get("format", FORMAT) > FORMAT:
+        raise UserError(f"{folder}: written by a newer freegeo (format {summary['format']}). Update freegeo.")
+    final = Reconstruction.load(folder)
+    found = {"adapted" if summary.get("adapter") else "frozen": final}
+    if (folder / FROZEN_FOLDER / FILE_NAME).is_file():
+        found = {"frozen": Reconstruction.load(folder / FROZEN_FOLDER), "adapted": final}
+    if truth is None and (folder / TRUTH_FOLDER / FILE_NAME).is_file():
+        truth = Reconstruction.load(folder / TRUTH_FOLDER)
+    for other in (*found.values(), *([truth] if truth else [])):
+        if other.depth_z.shape != final.depth_z.shape:
+            raise FreeGeoError(f"{folder}: reconstructions of different sizes cannot be compared. Run again.")
+    reference = truth or final
+    stages = {key: _stage(key, value, reference, truth) for key, value in found.items()}
+    if truth is not None:
+        stages["truth"] = _truth_stage(truth)
+    return Result(
+        folder=folder,
+        summary=summary,
+        adaptation=_mapping(folder / ADAPTER_PAGE),
+        scores=_mapping(folder / SCORES_NAME),
+        stages=stages,
+        names=final.names,
+        images=final.images,
+        from_own_frame=align(final, reference) if final.has_cameras and reference.has_cameras else None,
+    )
+
+
+def moved(result: Result, onto: Stage) -> Result:
+    """Return a result of the same photos moved into the frame of another one's final stage."""
+    if result.final.depth_z.shape != onto.depth_z.shape:
+        raise UserError(f"{result.folder}: shows other photos or another resolution; only one scene can be compared.")
+    if result.final.T_cam_world is None or onto.T_cam_world is None:
+        return result
+    move = _similarity(result.final.depth_z, result.final.T_cam_world, onto.depth_z, onto.T_cam_world)
+    stages = {}
+    for key, stage in result.stages.items():
+        assert stage.T_cam_world is not None
+        depth_z, T_cam_world = _moved(stage.depth_z, stage.T_cam_world, move)
+        stages[key] = replace(stage, depth_z=depth_z, T_cam_world=T_cam_world)
+    own = result.from_own_frame
+    both = None if own is None else Sim3(s=move.s * own.s, R=move.R @ own.R, t=move.apply(own.t))
+    return replace(result, stages=stages, from_own_frame=both)
+
+
+def align(estimate: Reconstruction, reference: Reconstruction) -> Sim3:
+    """Similarity from an estimate's world frame to a reference's, both of the same views and size.
+
+    The scale is the median ratio of depths, the rotation the mean over the cameras, the translation the median over
+    their centres. Unlike a fit to the centres alone it stands also for cameras on a line or in one place.
+    """
+    return _similarity(estimate.depth_z, estimate.cameras()[0], reference.depth_z, reference.cameras()[0])
+
+
+def _similarity(depth: np.ndarray, T: np.ndarray, depth_reference: np.ndarray, T_reference: np.ndarray) -> Sim3:
+    scale = median_ratio(depth_reference, depth)
+    cameras, goal = torch.from_numpy(T).double(), torch.from_numpy(T_reference).double()
+    U, _, Vh = torch.linalg.svd((goal[:, :3, :3].mT @ cameras[:, :3, :3]).mean(0))
+    signs = torch.ones(3, dtype=torch.float64)
+    signs[2] = torch.linalg.det(U @ Vh).sign()
+    R = (U * signs) @ Vh
+    t = (camera_centres(goal) - scale * camera_centres(cameras) @ R.mT).median(0).values
+    return Sim3(s=torch.tensor(scale, dtype=torch.float64), R=R, t=t)
+
+
+def median_ratio(reference: np.ndarray, estimate: np.ndarray) -> float:
+    """Median of reference / estimate over pixels valid in both; 1 when there is none."""
+    valid = _valid(reference) & _valid(estimate)
+    return float(np.median(reference[valid] / estimate[valid])) if valid.any() else 1.0
+
+
+def _valid(depth_z: np.ndarray) -> np.ndarray:
+    return valid_depth(torch.from_numpy(depth_z)).numpy()
+
+
+def _stage(key: str, value: Reconstruction, reference: Reconstruction, truth: Reconstruction | None) -> Stage:
+    keep, removed = _valid(value.depth_z), {}
+    if value.has_cameras:
+        keep, report = filter_reconstruction(value)
+        removed = dict(report.removed)
+    depth_z, T_cam_world = value.depth_z, value.T_cam_world
+    if value.has_cameras and reference.has_cameras:
+        depth_z, T_cam_world = _moved(depth_z, value.cameras()[0], align(value, reference))
+    else:
+        depth_z = (depth_z * median_ratio(reference.depth_z, depth_z)).astype(np.float32)
+    error = None if truth is None else relative_error(depth_z, truth.depth_z)
+    return Stage(
+        key=key, depth_z=depth_z, conf=value.conf, T_cam_world=T_cam_world, K=value.K, keep=keep, removed=removed,
+        error=error,
+    )  # fmt: skip
+
+
+def _truth_stage(truth: Reconstruction) -> Stage:
+    return Stage(
+        key="truth", depth_z=truth.depth_z, conf=np.ones_like(truth.depth_z), T_cam_world=truth.T_cam_world, K=truth.K,
+        keep=_valid(truth.depth_z), removed={}, error=np.zeros_like(truth.depth_z),
+    )  # fmt: skip
+
+
+def _moved(depth_z: np.ndarray, T_cam_world: np.ndarray, move: Sim3) -> tuple[np.ndarray, np.ndarray]:
+    cameras = move.apply_to_cameras(torch.from_numpy(T_cam_world).double()).float().numpy()
+    return (depth_z * float(move.s)).astype(np.float32), cameras
+
+
+def relative_error(depth_z: np.ndarray, true_z: np.ndarray) -> np.ndarray:
+    """|d - d_true| / d_true (S, H, W) float32, NaN where one of the two is not valid."""
+    valid = _valid(depth_z) & _valid(true_z)
+    error = np.full(depth_z.shape, np.nan, dtype=np.float32)
+    error[valid] = np.abs(depth_z[valid] - true_z[valid]) / true_z[valid]
+    return error
+
+
+def camera_difference(estimate: Stage, reference: Stage) -> tuple[np.ndarray, np.ndarray]:
+    """Angle in degrees (S,) and distance in the common units (S,) between two stages' cameras, view by view."""
+    assert estimate.T_cam_world is not None
+    assert reference.T_cam_world is not None
+    a, b = (torch.from_numpy(s.T_cam_world).double() for s in (estimate, reference))
+    cosine = ((a[:, :3, :3] * b[:, :3, :3]).sum((-2, -1)) - 1) / 2
+    distance = torch.linalg.vector_norm(camera_centres(a) - camera_centres(b), dim=-1)
+    return torch.rad2deg(cosine.clamp(-1, 1).arccos()).numpy(), distance.numpy()
+
+
+def _mapping(path: Path) -> Mapping[str, Any]:
+    if not path.is_file():
+        return {}
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise FreeGeoError(f"{path}: damaged file (not an object). Remove it and run again.")
+    return content

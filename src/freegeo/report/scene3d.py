@@ -1,0 +1,129 @@
+"""The 3D scene of a report: a level frame to look at it in, and its points packed for the page."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import numpy as np
+
+from freegeo.export.glb import frustum_corners
+from freegeo.report.result import Result, Stage
+
+MAX_KEPT, MAX_REMOVED = 36_000, 9_000
+"""Points of one stage in the page; the files beside it hold all."""
+ERROR_LIMIT = 0.3
+"""Relative depth error that has the last colour."""
+NO_ERROR = 255
+
+
+def level_rotation(T_cam_world: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) from the world to x right, y up, z towards the viewer, for cameras (S, 4, 4).
+
+    Up is the mean up of the cameras; forward is their mean viewing direction, made level.
+    """
+    R = T_cam_world[:, :3, :3].astype(np.float64)
+    up = _unit(-R[:, 1].mean(0), -R[0, 1])
+    forward = R[:, 2].mean(0)
+    # Cameras all round, or straight down, have no level mean direction: the first one's right side decides.
+    right = _unit(np.cross(forward, up), np.cross(np.cross(up, R[0, 0]), up), least=0.05)
+    return np.stack((right, up, np.cross(right, up)))
+
+
+def _unit(vector: np.ndarray, otherwise: np.ndarray, least: float = 1e-6) -> np.ndarray:
+    chosen = vector if np.linalg.norm(vector) > least else otherwise
+    return chosen / np.linalg.norm(chosen)
+
+
+def scene_data(result: Result) -> dict[str, Any]:
+    """Everything the page's 3D view needs, as JSON-like values; UserError without cameras."""
+    final = result.final
+    assert final.T_cam_world is not None
+    level = level_rotation(final.T_cam_world)
+    points = {stage.key: stage.world_points() @ level.T.astype(np.float32) for stage in result.stages.values()}
+    seen = points[final.key][final.keep] if final.keep.any() else points[final.key].reshape(-1, 3)
+    target = np.quantile(seen, (0.03, 0.97), axis=0).mean(axis=0)
+    radius = float(np.quantile(np.linalg.norm(seen - target, axis=1), 0.9)) or 1.0
+    spacing = float(np.median(_covered(final)[final.keep])) if final.keep.any() else radius / 100
+    return {
+        "target": _rounded(target),
+        "radius": radius,
+        "stages": [
+            {
+                "key": stage.key,
+                "label": stage.label,
+                **_packed(stage, points[stage.key], result.images, spacing),
+                "cameras": _cameras(stage, level, 0.1 * radius),
+                "spacing": spacing,
+            }
+            for stage in result.stages.values()
+        ],
+    }
+
+
+def _packed(stage: Stage, points: np.ndarray, images: np.ndarray, spacing: float) -> dict[str, Any]:
+    """Points as base64: xyz float32, RGB, confidence rank, error, kept flag, size, one array after the other.
+
+    The size of a point is what its pixel covers, and more when points were left out: `spacing` times
+    2 ** ((byte - 128) / 16).
+    """
+    rng = np.random.default_rng(0)
+    valid = np.isfinite(points).all(-1) & (stage.depth_z > 0)
+    kept = _choice(np.flatnonzero(stage.keep & valid), MAX_KEPT, rng)
+    removed = _choice(np.flatnonzero(~stage.keep & valid), MAX_REMOVED, rng)
+    # In random order, so that what is drawn first hides nothing systematically.
+    index = rng.permutation(np.concatenate((kept, removed)))
+    flag = stage.keep.reshape(-1)[index]
+    left_out = max(1.0, int(stage.keep.sum()) / MAX_KEPT) ** 0.5
+    size = _covered(stage).reshape(-1)[index] * left_out
+    arrays = (
+        points.reshape(-1, 3)[index].astype("<f4"),
+        images.reshape(-1, 3)[index],
+        _ranks(stage.conf.reshape(-1)[index], flag),
+        _error_bytes(stage, index),
+        flag.astype(np.uint8),
+        np.clip(128 + 16 * np.log2(size / spacing), 0, 255).astype(np.uint8),
+    )
+    packed = base64.b64encode(b"".join(a.tobytes() for a in arrays)).decode("ascii")
+    return {"count": len(index), "points": packed}
+
+
+def _choice(index: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
+    return index if len(index) <= most else rng.choice(index, most, replace=False)
+
+
+def _ranks(conf: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Percentile (n,) uint8 of each confidence among the kept points: 0 the least confident, 100 the most."""
+    levels = np.sort(conf[kept])
+    if len(levels) == 0 or levels[0] == levels[-1]:
+        return np.full(len(conf), 100, dtype=np.uint8)
+    return (100 * np.searchsorted(levels, conf, side="right") / len(levels)).astype(np.uint8)
+
+
+def _error_bytes(stage: Stage, index: np.ndarray) -> np.ndarray:
+    if stage.error is None:
+        return np.full(len(index), NO_ERROR, dtype=np.uint8)
+    error = stage.error.reshape(-1)[index]
+    scaled = np.clip(np.nan_to_num(error) / ERROR_LIMIT, 0, 1) * (NO_ERROR - 1)
+    return np.where(np.isfinite(error), scaled, NO_ERROR).astype(np.uint8)
+
+
+def _cameras(stage: Stage, level: np.ndarray, depth: float) -> list[list[list[float]]]:
+    """Five corners of every camera's frustum: centre, then the image's corners clockwise from top left."""
+    assert stage.T_cam_world is not None
+    assert stage.K is not None
+    height, width = stage.depth_z.shape[1:]
+    corners = [
+        frustum_corners(T, K, (height, width), depth) @ level.T for T, K in zip(stage.T_cam_world, stage.K, strict=True)
+    ]
+    return [[_rounded(corner) for corner in camera] for camera in corners]
+
+
+def _covered(stage: Stage) -> np.ndarray:
+    """Width (S, H, W) that each pixel covers at its depth."""
+    assert stage.K is not None
+    return stage.depth_z / np.sqrt(stage.K[:, 0, 0] * stage.K[:, 1, 1])[:, None, None]
+
+
+def _rounded(vector: np.ndarray) -> list[float]:
+    return [float(f"{value:.5g}") for value in vector]

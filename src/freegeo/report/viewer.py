@@ -1,0 +1,351 @@
+"""The interactive viewer: one or two output folders in a browser, through viser.
+
+Points lie in bands of equal confidence, so that moving the confidence slider only hides and shows what the browser
+already has; this keeps it quick also through a tunnel.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from freegeo.errors import FreeGeoError, UserError
+from freegeo.export.mesh import FILE_NAME as MESH_NAME
+from freegeo.geometry.rotation import matrix_to_quat_xyzw, quat_xyzw_to_wxyz
+from freegeo.report.figures import CONF_MAP, DEPTH_MAP, ERROR_MAP, linear_colours, log_colours, log_range
+from freegeo.report.result import Result, Stage, load_result, moved
+from freegeo.report.scene3d import ERROR_LIMIT, level_rotation
+
+logger = logging.getLogger(__name__)
+
+LOCAL_HOSTS = frozenset({"127.0.0.1", "localhost", "::1"})
+BANDS = 20
+MAX_POINTS = 600_000
+"""Points of one stage that are sent to the browser; of more, a seeded choice."""
+THUMBNAIL_WIDTH = 240
+FRUSTUM_SHARE = 0.06
+STAGE_COLOURS = {"frozen": (214, 122, 32), "adapted": (42, 124, 204), "truth": (64, 160, 92)}
+SCREENSHOT_HW = (1080, 1920)
+OUTSIDE = "outside"
+MODES = ("photo", "depth", "confidence", "error")
+Ranges = dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layer:
+    """One stage of one folder, as it is chosen in the viewer."""
+
+    label: str
+    name: str
+    """Path of its nodes in the scene."""
+    stage: Stage
+    result: Result
+
+
+class Viewer:
+    """A running viewer; `close` ends it."""
+
+    def __init__(self, results: Sequence[Result], *, host: str, port: int):
+        viser = _viser()
+        self.layers = _layers(results)
+        self.names = list(results[0].names)
+        # viser announces itself on stdout; what is said to the user is the command's business.
+        with redirect_stdout(io.StringIO()):
+            self.server = viser.ViserServer(host=host, port=port, label="freegeo", verbose=False)
+        self.bands: dict[str, list[Any]] = {}
+        self.colours: dict[str, dict[str, list[np.ndarray]]] = {}
+        self.frusta: dict[str, list[Any]] = {}
+        self.meshes: dict[str, Any] = {}
+        self._place(results[0])
+        ranges = {
+            "depth": log_range([layer.stage.depth_z for layer in self.layers]),
+            "confidence": log_range([layer.stage.conf for layer in self.layers]),
+        }
+        for layer in self.layers:
+            self._add(layer, ranges)
+        self._add_controls()
+        self._apply()
+
+    def close(self) -> None:
+        """Stop serving."""
+        with redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def _place(self, result: Result) -> None:
+        """Choose up, size and the first view from the final cameras and points."""
+        final = result.final
+        assert final.T_cam_world is not None
+        level = level_rotation(final.T_cam_world)
+        points = final.world_points()
+        seen = points[final.keep] if final.keep.any() else points.reshape(-1, 3)
+        centre = np.quantile(seen @ level.T, (0.03, 0.97), axis=0).mean(axis=0) @ level
+        self.radius = float(np.quantile(np.linalg.norm(seen - centre, axis=1), 0.9)) or 1.0
+        self.spacing = _spacing(final)
+        self.server.scene.set_up_direction(level[1])
+        self.server.scene.configure_default_lights(cast_shadow=False)
+        first = self.server.initial_camera
+        first.look_at = centre
+        first.position = centre + self.radius * (np.array([0.7, 0.9, 1.7]) @ level)
+        first.up = level[1]
+        first.near, first.far = 1e-3 * self.radius, 1e3 * self.radius
+
+    def _add(self, layer: Layer, ranges: Ranges) -> None:
+        points, colours, order = _banded(layer.stage, layer.result.images, ranges)
+        self.colours[layer.name] = colours
+        self.bands[layer.name] = [
+            self.server.scene.add_point_cloud(
+                f"{layer.name}/points/{band:02d}", points[rows], colours["photo"][band], point_size=self.spacing,
+                point_shape="circle", point_shading="flat", precision="float32",
+            )
+            for band, rows in enumerate(order)
+        ]  # fmt: skip
+        self.frusta[layer.name] = list(self._add_frusta(layer))
+        mesh = _mesh(layer)
+        if mesh is not None:
+            self.meshes[layer.name] = self.server.scene.add_mesh_trimesh(f"{layer.name}/mesh", mesh)
+
+    def _add_frusta(self, layer: Layer) -> Iterator[Any]:
+        stage = layer.stage
+        assert stage.T_cam_world is not None
+        assert stage.K is not None
+        height, width = stage.depth_z.shape[1:]
+        poses, places = camera_poses(stage)
+        for view, image in enumerate(layer.result.images):
+            handle = self.server.scene.add_camera_frustum(
+                f"{layer.name}/cameras/{view:03d}", fov=field_of_view(stage, view), aspect=width / height,
+                scale=FRUSTUM_SHARE * self.radius, thickness=0.002 * self.radius,
+                color=STAGE_COLOURS[stage.key], image=_thumbnail(image), format="jpeg", wxyz=poses[view],
+                position=places[view], cast_shadow=False,
+            )  # fmt: skip
+            handle.on_click(lambda _, view=view: self._set_follow(view))
+            yield handle
+
+    def _add_controls(self) -> None:
+        gui = self.server.gui
+        labels = [layer.label for layer in self.layers]
+        final = next(layer.label for layer in self.layers if layer.stage is layer.result.final)
+        self.shown = gui.add_dropdown("Shown", labels, initial_value=final)
+        swap = gui.add_button("Swap frozen / adapted", disabled=len({layer.stage.key for layer in self.layers}) < 2)
+        modes = [m for m in MODES if all(m in colours for colours in self.colours.values())]
+        self.mode = gui.add_dropdown("Colour", modes, initial_value="photo")
+        self.hidden = gui.add_slider("Hide least confident %", 0, 95, 5, 0)
+        self.size = gui.add_slider("Point size", 0.2, 6.0, 0.1, 1.5)
+        self.with_points = gui.add_checkbox("Points", True)
+        self.with_cameras = gui.add_checkbox("Cameras", True)
+        self.with_mesh = gui.add_checkbox("Mesh", False, visible=bool(self.meshes))
+        choices = [OUTSIDE, *(f"{view + 1}: {name}" for view, name in enumerate(self.names))]
+        self.follow = gui.add_dropdown("Follow camera", choices, initial_value=OUTSIDE)
+        picture = gui.add_button("Save screenshot")
+        for control in (self.shown, self.size, self.hidden, self.with_points, self.with_cameras, self.with_mesh):
+            control.on_update(lambda _: self._apply())
+        self.mode.on_update(lambda _: self._recolour())
+        self.follow.on_update(lambda _: self._apply())
+        self.server.on_client_connect(lambda _: self._go_to_camera())
+        swap.on_click(lambda _: self._swap())
+        picture.on_click(lambda event: self._screenshot(event.client))
+
+    def _layer(self) -> Layer:
+        return next(layer for layer in self.layers if layer.label == self.shown.value)
+
+    def _apply(self) -> None:
+        """Show what the controls say."""
+        chosen = self._layer()
+        first_band = round(self.hidden.value / 100 * BANDS)
+        # Seen from one of the cameras, frusta and their pictures would stand in the way.
+        cameras = self.with_cameras.value and self.follow.value == OUTSIDE
+        with self.server.atomic():
+            for layer in self.layers:
+                here = layer is chosen
+                for band, handle in enumerate(self.bands[layer.name]):
+                    handle.visible = here and self.with_points.value and band >= first_band
+                    handle.point_size = self.size.value * self.spacing
+                for handle in self.frusta[layer.name]:
+                    handle.visible = here and cameras
+                if layer.name in self.meshes:
+                    self.meshes[layer.name].visible = here and self.with_mesh.value
+        self._go_to_camera()
+
+    def _recolour(self) -> None:
+        with self.server.atomic():
+            for name, handles in self.bands.items():
+                for handle, colours in zip(handles, self.colours[name][self.mode.value], strict=True):
+                    handle.colors = colours
+
+    def _swap(self) -> None:
+        """Show the other prediction of the same folder."""
+        now = self._layer()
+        others = [x for x in self.layers if x.result is now.result and x.stage.key != "truth" and x is not now]
+        if others:
+            self.shown.value = others[0].label
+
+    def _set_follow(self, view: int) -> None:
+        self.follow.value = self.follow.options[view + 1]
+
+    def _go_to_camera(self) -> None:
+        """Put every visitor where the chosen camera is, looking where it looks."""
+        view = self.follow.options.index(self.follow.value) - 1
+        if view < 0:
+            return
+        stage = self._layer().stage
+        poses, places = camera_poses(stage)
+        for client in self.server.get_clients().values():
+            with client.atomic():
+                client.camera.wxyz = poses[view]
+                client.camera.position = places[view]
+                client.camera.fov = field_of_view(stage, view)
+
+    def _screenshot(self, client: Any) -> None:
+        if client is None:
+            return
+        from PIL import Image
+
+        height, width = SCREENSHOT_HW
+        picture = client.get_render(height=height, width=width, transport_format="jpeg")
+        buffer = io.BytesIO()
+        Image.fromarray(picture).save(buffer, "PNG")
+        client.send_file_download("freegeo.png", buffer.getvalue(), save_immediately=True)
+
+
+def open_viewer(folders: Sequence[Path], *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
+    """Serve one or two output folders of the same photos; returns at once, the server runs in a thread of its own.
+
+    Args:
+        folders: output folders; the second is moved and scaled onto the first.
+        host: address to listen on. Other than localhost, everybody who reaches it sees the photos.
+        port: to listen on.
+
+    Raises:
+        UserError: viser is not installed, the port is in use or out of range, a folder holds no reconstruction, has no
+            cameras, or the two folders show different photos.
+        FreeGeoError: a damaged file.
+    """
+    if not 1 <= len(folders) <= 2:
+        raise UserError(f"The viewer shows one or two output folders, got {len(folders)}.")
+    _viser()
+    require_free_port(host, port)
+    results = [load_result(Path(folder)) for folder in folders]
+    for result in results:
+        if not result.has_cameras:
+            raise UserError(f"{result.folder}: has no cameras, so there is nothing to show in 3D.")
+    if len(results) == 2:
+        if list(results[0].names) != list(results[1].names):
+            raise UserError(
+                f"{results[1].folder}: shows other photos than {results[0].folder}; compare runs of one scene."
+            )
+        results[1] = moved(results[1], onto=results[0].final)
+    return Viewer(results, host=host, port=port)
+
+
+def require_free_port(host: str, port: int) -> None:
+    """Raise UserError when nobody can listen there; viser itself would silently take another port."""
+    if not 1 <= port <= 65535:
+        raise UserError(f"--port must be from 1 to 65535, got {port}.")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except socket.gaierror:
+        raise UserError(
+            f"--host {host}: no such address of this machine. Leave it out to listen on localhost."
+        ) from None
+    except OSError as error:
+        raise UserError(
+            f"port {port} on {host} cannot be used ({error.strerror}). Choose another with --port."
+        ) from None
+
+
+def field_of_view(stage: Stage, view: int) -> float:
+    """Vertical field of view of a camera in radians."""
+    assert stage.K is not None
+    return float(2 * np.arctan(stage.depth_z.shape[1] / 2 / stage.K[view, 1, 1]))
+
+
+def camera_poses(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+    """Orientation camera -> world as quat_wxyz (S, 4) and position (S, 3), which is how viser takes cameras."""
+    assert stage.T_cam_world is not None
+    R = torch.from_numpy(stage.T_cam_world[:, :3, :3]).double().mT
+    places = -np.einsum("sij,sj->si", R.numpy(), stage.T_cam_world[:, :3, 3].astype(np.float64))
+    return quat_xyzw_to_wxyz(matrix_to_quat_xyzw(R)).numpy(), places
+
+
+def _layers(results: Sequence[Result]) -> list[Layer]:
+    names = _folder_names(results)
+    layers = []
+    for number, (result, name) in enumerate(zip(results, names, strict=True)):
+        for stage in result.stages.values():
+            if number == 0 or stage.key != "truth":
+                label = stage.label if len(results) == 1 else f"{stage.label} ({name})"
+                layers.append(Layer(label=label, name=f"/{number}/{stage.key}", stage=stage, result=result))
+    return layers
+
+
+def _folder_names(results: Sequence[Result]) -> list[str]:
+    names = [result.folder.resolve().name for result in results]
+    return names if len(set(names)) == len(names) else [str(result.folder) for result in results]
+
+
+def _banded(
+    stage: Stage, images: np.ndarray, ranges: Ranges
+) -> tuple[np.ndarray, dict[str, list[np.ndarray]], list[np.ndarray]]:
+    """Kept points (n, 3), their colours per mode and band, and the rows of each band, least confident first."""
+    index = np.flatnonzero(stage.keep)
+    if len(index) > MAX_POINTS:
+        logger.info("%s: %d of %d points are shown", stage.label, MAX_POINTS, len(index))
+        index = np.sort(np.random.default_rng(0).choice(index, MAX_POINTS, replace=False))
+    points = stage.world_points().reshape(-1, 3)[index]
+    depth, conf = stage.depth_z.reshape(-1)[index], stage.conf.reshape(-1)[index]
+    colours = {
+        "photo": images.reshape(-1, 3)[index],
+        "depth": log_colours(depth, ranges["depth"], DEPTH_MAP),
+        "confidence": log_colours(conf, ranges["confidence"], CONF_MAP),
+    }
+    if stage.error is not None:
+        colours["error"] = linear_colours(stage.error.reshape(-1)[index], (0, ERROR_LIMIT), ERROR_MAP)
+    order = np.array_split(np.argsort(conf, kind="stable"), BANDS)
+    return points, {mode: [values[rows] for rows in order] for mode, values in colours.items()}, order
+
+
+def _spacing(stage: Stage) -> float:
+    assert stage.K is not None
+    covered = stage.depth_z / np.sqrt(stage.K[:, 0, 0] * stage.K[:, 1, 1])[:, None, None]
+    return float(np.median(covered[stage.keep])) if stage.keep.any() else 0.01
+
+
+def _thumbnail(image: np.ndarray) -> np.ndarray:
+    step = max(1, image.shape[1] // THUMBNAIL_WIDTH)
+    return np.ascontiguousarray(image[::step, ::step])
+
+
+def _mesh(layer: Layer) -> Any:
+    """The mesh of the folder in the viewer's frame; it shows the final stage and stands in that stage's own frame."""
+    path = layer.result.folder / MESH_NAME
+    if layer.stage is not layer.result.final or not path.is_file():
+        return None
+    import trimesh
+
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+    except (ValueError, IndexError, OSError) as error:
+        raise FreeGeoError(f"{path}: damaged mesh ({error}). Export it again.") from None
+    move = layer.result.from_own_frame
+    if move is not None:
+        mesh.vertices = move.apply(torch.from_numpy(np.asarray(mesh.vertices, dtype=np.float64))).numpy()
+    return mesh
+
+
+def _viser() -> Any:
+    try:
+        import viser
+    except ImportError:
+        raise UserError("The viewer needs an extra: pip install 'freegeo[view]'.") from None
+    return viser

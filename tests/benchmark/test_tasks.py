@@ -1,0 +1,170 @@
+import errno
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bench_tools import DATASET, ROOMS, task
+from freegeo.benchmark import adapters, stored
+from freegeo.benchmark.predict import Predictor, predict_all
+from freegeo.benchmark.stored import read_stored
+from freegeo.benchmark.tasks import (
+    DAMAGED,
+    FRAME_RULES,
+    PREDICTION_FILE,
+    TASK_FILE,
+    Problem,
+    choose_frames,
+    differences,
+    finish,
+    is_finished,
+    run_each,
+    stored_tasks,
+)
+from freegeo.data.datasets import load_scene
+from freegeo.errors import UserError
+
+
+@pytest.mark.parametrize("rule", FRAME_RULES)
+def test_frames_ascend_and_depend_on_the_seed_alone(rule):
+    for views in (4, 8, 16):
+        frames = choose_frames(rule, 40, views, 43)
+        assert frames == choose_frames(rule, 40, views, 43) == sorted(set(frames))
+        assert len(frames) == views
+        assert choose_frames(rule, 3, views, 43) == [0, 1, 2]
+
+
+def test_the_two_families_choose_four_frames_differently():
+    eight = choose_frames("da3", 40, 8, 43)
+    assert set(choose_frames("da3", 40, 4, 43)) < set(eight)
+    assert choose_frames("vggt", 40, 4, 43) == eight[::2]
+    assert choose_frames("da3", 40, 4, 43) != eight[::2]
+    assert choose_frames("vggt", 40, 8, 43) == eight
+
+
+def test_neighbours_stand_in_a_row():
+    assert np.diff(choose_frames("neighbours", 16, 8, 45)).tolist() == [1] * 7
+    assert np.diff(choose_frames("neighbours", 16, 4, 45)).tolist() == [2] * 3
+    with pytest.raises(UserError, match="da3"):
+        choose_frames("last", 16, 4, 45)
+
+
+def test_differences_are_named_with_their_place():
+    found = differences({"recipe": {"lr": 1, "rank": 4}, "model": "a"}, {"recipe": {"lr": 2, "rank": 4}, "model": "a"})
+    assert found == ["recipe.lr: 1 there, 2 now"]
+    assert differences({"adaptation": None}, {"adaptation": {"per": "scene"}})
+
+
+def test_a_task_of_other_settings_is_not_taken_for_finished(tmp_path):
+    one = task()
+    assert not is_finished(one, tmp_path, {"model": "a"})
+    finish(one, tmp_path, {"model": "a"}, frames=[0])
+    assert is_finished(one, tmp_path, {"model": "a"})
+    with pytest.raises(UserError, match="model"):
+        is_finished(one, tmp_path, {"model": "b"})
+    assert not is_finished(one, tmp_path, {"model": "b"}, overwrite=True)
+    assert [found for found, _ in stored_tasks(tmp_path)] == [one]
+
+
+def test_a_failing_item_does_not_stop_the_others_but_a_bug_does():
+    def work(number):
+        if number == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        done.append(number)
+
+    def explain(number, error):
+        return Problem(dataset="d", scene=str(number), stage="predict", what="x", reason=error.strerror)
+
+    done = []
+    problems = run_each([1, 2, 3], work, explain)
+    assert done == [1, 3]
+    assert [problem.scene for problem in problems] == ["2"]
+    with pytest.raises(TypeError):
+        run_each([None], lambda item: item + 1, explain)
+    assert not issubclass(KeyboardInterrupt, DAMAGED)
+
+
+def test_a_stopped_run_continues_where_it_was(setup, monkeypatch):
+    tasks = [task(variant, scene=scene) for scene in ROOMS for variant in ("frozen", "adapted")]
+    assert predict_all(Predictor(setup), tasks) == []
+    whole = {one: read_stored(one, setup.out).prediction.depth_z for one in tasks}
+    for one in tasks[2:]:
+        (one.folder(setup.out) / TASK_FILE).unlink()
+    kept = [(one.folder(setup.out) / PREDICTION_FILE).stat().st_mtime_ns for one in tasks[:2]]
+
+    predicted = []
+    again = Predictor(setup)
+    monkeypatch.setattr(adapters, "adapt", lambda *_, **__: pytest.fail("the adapter is there"))
+    assert predict_all(again, tasks, on_task=predicted.append) == []
+    assert set(predicted) == set(tasks[2:])
+    assert [(one.folder(setup.out) / PREDICTION_FILE).stat().st_mtime_ns for one in tasks[:2]] == kept
+    assert all(torch.equal(read_stored(one, setup.out).prediction.depth_z, whole[one]) for one in tasks)
+
+
+def test_what_is_stored_is_what_the_model_says(predictor):
+    """The adapted prediction differs from the frozen one, and the model is left without its adapter."""
+    one, eight_to_four, adapted = task(), task("8to4", rule="experiment"), task("adapted")
+    assert predict_all(predictor, [one, eight_to_four, adapted]) == []
+    scene = load_scene(predictor.setup.data, DATASET, ROOMS[0])
+    samples = {one: choose_frames("da3", 16, 4, 43), eight_to_four: choose_frames("experiment", 16, 8, 43)}
+    for entry, encoded in samples.items():
+        found = read_stored(entry, predictor.setup.out)
+        model = predictor.model
+        with torch.no_grad():
+            tokens = model.embed(model.preprocess([scene.photos[i] for i in encoded]).images[None])
+            features = model.aggregate(tokens, reference="first")
+            kept = [encoded.index(frame) for frame in found.frames]
+            expected = model.decode(features.select(kept))
+        torch.testing.assert_close(found.prediction.depth_z, expected.depth_z[0], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(found.prediction.T_cam_world, expected.T_cam_world[0], rtol=1e-3, atol=1e-4)
+    frozen, changed = (read_stored(entry, predictor.setup.out).prediction.depth_z for entry in (one, adapted))
+    assert not torch.equal(frozen, changed)
+
+
+def test_equal_recipes_share_an_adapter_and_epochs_can_be_chosen(setup):
+    epochs = replace(setup, changes={"epochs": 2, "batch": 1, "sets_per_scene": 1})
+    first = Predictor(replace(epochs, epoch=0, out=setup.out / "first"))
+    last = Predictor(replace(epochs, out=setup.out / "last"))
+    jobs = last.adapter_jobs([task("adapted"), task("anchors-mixed"), task("anchors-top"), task("rank-16")])
+    assert len({job.digest for job in jobs}) == len(jobs) == 2
+    for one in (first, last):
+        assert predict_all(one, [task("adapted")]) == []
+    depths = [read_stored(task("adapted"), one.setup.out).prediction.depth_z for one in (first, last)]
+    assert not torch.equal(*depths)
+    per_scene = Predictor(replace(setup, adapt_per="scene"))
+    assert len(per_scene.adapter_jobs([task("adapted", scene=scene) for scene in ROOMS])) == 2
+
+
+def test_a_full_disk_and_a_damaged_room_are_reported_by_name(predictor, monkeypatch):
+    written = []
+
+    def full(path, arrays):
+        if not written:
+            written.append(path)
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        return write(path, arrays)
+
+    write = stored.write_npz
+    monkeypatch.setattr(stored, "write_npz", full)
+    load_scene(predictor.setup.data, DATASET, ROOMS[1])
+    room = predictor.setup.data / DATASET / f"{ROOMS[1]}.npz"
+    room.write_bytes(room.read_bytes()[:1000])
+    tasks = [task(), task(seed=44), task(scene=ROOMS[1]), task(scene="7")]
+    problems = predict_all(predictor, tasks)
+    assert [(problem.scene, problem.stage) for problem in problems] == [
+        (ROOMS[0], "predict"), (ROOMS[1], "predict"), ("7", "predict"),
+    ]  # fmt: skip
+    assert "No space left" in problems[0].reason
+    assert "damaged" in problems[1].reason
+    assert [one for one, _ in stored_tasks(predictor.setup.out)] == [task(seed=44)]
+
+
+def test_a_room_too_small_to_adapt_to_is_left_out(predictor, monkeypatch):
+    whole = load_scene(predictor.setup.data, DATASET, ROOMS[0])
+    rooms = {ROOMS[0]: whole, ROOMS[1]: whole.select([0, 1])}
+    monkeypatch.setattr("freegeo.benchmark.adapters.load_scene", lambda data, dataset, name: rooms[name])
+    (problem,) = predict_all(predictor, [task("adapted")])
+    assert (problem.scene, problem.stage) == (ROOMS[1], "adapt")
+    assert "2 frames" in problem.reason
+    assert len(stored_tasks(predictor.setup.out)) == 1

@@ -1,0 +1,202 @@
+"""The report is opened from its file, moved and switched, and its pictures change as they should."""
+
+import base64
+
+import numpy as np
+import pytest
+
+from example_results import HOSTILE_NAME, write_example
+from freegeo.report.page import write_report
+
+PIXELS = """() => {
+  const canvas = document.getElementById("canvas3d");
+  const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+  let text = "";
+  for (let at = 0; at < data.length; at += 8192) text += String.fromCharCode(...data.subarray(at, at + 8192));
+  return btoa(text);
+}"""
+LUMINANCE = """(element) => {
+  const parts = (text) => text.match(/[\\d.]+/g).map(Number);
+  const light = ([r, g, b]) => [r, g, b].map((v) => v / 255)
+    .map((v) => v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, v, k) => sum + v * [0.2126, 0.7152, 0.0722][k], 0);
+  let behind = element;
+  while (getComputedStyle(behind).backgroundColor === "rgba(0, 0, 0, 0)") behind = behind.parentElement;
+  const a = light(parts(getComputedStyle(element).color)), b = light(parts(getComputedStyle(behind).backgroundColor));
+  return (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+}"""
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    folder = write_example(tmp_path_factory.mktemp("report") / "out", names=(HOSTILE_NAME,))
+    return write_report(folder).as_uri()
+
+
+def canvas(page) -> np.ndarray:
+    """The canvas (n, 4) once it has been drawn after the last change."""
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    return np.frombuffer(base64.b64decode(page.evaluate(PIXELS)), dtype=np.uint8).reshape(-1, 4)
+
+
+def drawn(pixels: np.ndarray) -> int:
+    return int((pixels[:, 3] > 0).sum())
+
+
+def slide(page, name: str, value: float) -> None:
+    page.eval_on_selector(
+        f"#{name}", "(s, value) => { s.value = value; s.dispatchEvent(new Event('input')); }", str(value)
+    )
+
+
+def test_the_3d_view_follows_its_controls(open_page, address):
+    page = open_page(address, width=800, height=600)
+    page.uncheck("#cameras3d")
+    start = canvas(page)
+    assert drawn(start) > 5000
+    assert len(np.unique(start[start[:, 3] > 0], axis=0)) > 500
+
+    slide(page, "size3d", 5)
+    assert drawn(canvas(page)) > 1.2 * drawn(start)
+    slide(page, "size3d", 0.5)
+    small = canvas(page)
+    assert drawn(small) < 0.8 * drawn(start)
+    slide(page, "conf3d", 80)
+    assert drawn(canvas(page)) < 0.6 * drawn(small)
+    assert page.inner_text("#conf3dText") == "80 %"
+    slide(page, "conf3d", 0)
+    slide(page, "size3d", 2)
+    assert np.array_equal(canvas(page), start), "controls back where they were give the same picture"
+
+    page.get_by_text("frozen", exact=True).first.click()
+    assert not np.array_equal(canvas(page), start)
+    page.get_by_text("adapted", exact=True).first.click()
+    assert np.array_equal(canvas(page), start)
+
+    for mode in ("confidence", "error"):
+        page.check(f"input[name=colour3d][value={mode}]", force=True)
+        coloured = canvas(page)
+        assert np.array_equal(coloured[:, 3], start[:, 3]), "the same points"
+        assert not np.array_equal(coloured, start)
+    page.check("input[name=colour3d][value=photo]", force=True)
+
+    page.check("#removed3d")
+    pixels = canvas(page).astype(int)
+    red = (pixels[:, 0] > 2.5 * pixels[:, 1]) & (pixels[:, 0] > 2.5 * pixels[:, 2]) & (pixels[:, 3] > 0)
+    assert red.sum() > 200
+    page.uncheck("#removed3d")
+    page.check("#cameras3d")
+    assert drawn(canvas(page)) > drawn(start)
+
+
+def test_mouse_wheel_and_keys_move_the_view(open_page, address):
+    page = open_page(address, width=800, height=600)
+    page.uncheck("#cameras3d")
+    box = page.locator("#canvas3d").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    start = canvas(page)
+
+    scrolled = page.evaluate("scrollY")
+    page.mouse.move(x, y)
+    page.mouse.wheel(0, 40)
+    assert np.array_equal(canvas(page), start), "the wheel scrolls the page until the view was clicked"
+    page.wait_for_timeout(300)
+    assert page.evaluate("scrollY") > scrolled
+    page.evaluate("scrollTo(0, 0)")
+
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 80, y + 10, steps=3)
+    page.mouse.up()
+    turned = canvas(page)
+    assert (turned != start).any(axis=1).mean() > 0.02
+    page.mouse.wheel(0, -400)
+    page.wait_for_timeout(200)
+    assert drawn(canvas(page)) > drawn(turned), "closer"
+    page.keyboard.press("ArrowLeft")
+    page.click("#reset3d")
+    assert np.array_equal(canvas(page), start)
+
+    page.select_option("#camera3d", "1")
+    inside = canvas(page)
+    assert drawn(inside) > 1.5 * drawn(start), "from a camera's place, what it saw fills the picture"
+
+
+def test_two_fingers_zoom(open_page, address):
+    page = open_page(address, width=390, height=844, touch=True)
+    page.uncheck("#cameras3d")
+    start = canvas(page)
+    page.evaluate(
+        """() => {
+          const canvas = document.getElementById("canvas3d"), box = canvas.getBoundingClientRect();
+          canvas.setPointerCapture = () => {};
+          const send = (type, id, x) => canvas.dispatchEvent(new PointerEvent(type, {
+            pointerId: id, clientX: box.x + x, clientY: box.y + 100, pointerType: "touch", buttons: 1, bubbles: true,
+          }));
+          send("pointerdown", 11, 150); send("pointerdown", 12, 200);
+          send("pointermove", 11, 125); send("pointermove", 12, 225);
+          send("pointerup", 11, 125); send("pointerup", 12, 225);
+        }"""
+    )
+    assert drawn(canvas(page)) > 1.3 * drawn(start)
+
+
+def test_maps_and_models_are_chosen(open_page, address):
+    page = open_page(address)
+
+    def captions():
+        shown = page.locator(".view >> nth=0 >> figcaption")
+        return [text for text in shown.all_inner_texts() if text]
+
+    def shown():
+        figures = page.locator(".view >> nth=0 >> figure")
+        return [f.locator("figcaption").inner_text() for f in figures.all() if f.is_visible()]
+
+    assert shown() == ["photo", "depth, frozen", "depth, adapted", "depth, ground truth", "change of depth"]
+    page.check("input[name=show][value=frozen]", force=True)
+    assert "depth, adapted" not in shown()
+    page.check("input[name=show][value=all]", force=True)
+    page.check("input[name=map][value=error]", force=True)
+    assert shown() == ["photo", "depth error, frozen", "depth error, adapted"]
+    page.check("input[name=map][value=all]", force=True)
+    assert len(shown()) == len(captions()) == 9
+    pictures = page.evaluate("[...document.images].map((i) => [i.complete, i.naturalWidth])")
+    assert all(complete and width == 64 for complete, width in pictures)
+    page.locator(".enlarge >> nth=1").click()
+    assert page.locator("dialog img").count() == 2
+    page.locator("dialog button").click()
+    assert not page.locator("dialog").is_visible()
+
+
+def test_file_names_do_nothing(open_page, address):
+    page = open_page(address)
+    assert page.evaluate("window.broken") is None
+    assert page.locator(".view h3 >> nth=0").inner_text() == f"1. {HOSTILE_NAME}"
+    assert page.locator("#camera3d option").nth(1).inner_text() == f"1: {HOSTILE_NAME}"
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("width", [360, 390, 1280])
+def test_it_is_readable_everywhere(open_page, address, width, dark):
+    page = open_page(address, width=width, height=844, dark=dark)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width, "no sideways scrolling"
+    for detail in page.locator("summary").all():
+        detail.click()
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    background = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert (sum(int(v) for v in background[4:-1].split(",")) < 200) == dark
+    for selector in (
+        "h1",
+        ".note",
+        "dt",
+        "dd",
+        "figcaption",
+        ".segments input:checked + span",
+        "td",
+        "summary",
+        ".hint",
+    ):
+        assert page.locator(selector).first.evaluate(LUMINANCE) >= 4.5, selector
+    drawing = page.locator(".figure").first
+    assert drawing.evaluate(LUMINANCE) >= 4.5
+    assert drawing.bounding_box()["height"] > 150

@@ -1,0 +1,168 @@
+import dataclasses
+import socket
+
+import numpy as np
+import pytest
+import torch
+
+from exact_rooms import room
+from example_results import write_example
+from freegeo.errors import UserError
+from freegeo.geometry.rotation import quat_wxyz_to_xyzw, quat_xyzw_to_matrix
+
+pytest.importorskip("viser")
+import itertools
+
+from freegeo.cli import view as command
+from freegeo.report import viewer
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory):
+    return write_example(tmp_path_factory.mktemp("viewer") / "out", hw=(24, 32))
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture
+def opened(example):
+    shown = viewer.open_viewer([example], port=free_port())
+    yield shown
+    shown.close()
+
+
+def visible(handles) -> int:
+    return sum(handle.visible for handle in handles)
+
+
+def test_the_controls_show_and_hide(opened):
+    names = {layer.stage.key: layer.name for layer in opened.layers}
+    assert list(names) == ["frozen", "adapted", "truth"]
+    assert opened.shown.value == "adapted"
+    assert visible(opened.bands[names["adapted"]]) == viewer.BANDS
+    assert visible(opened.bands[names["frozen"]]) == 0
+    opened.hidden.value = 50
+    opened._apply()
+    assert visible(opened.bands[names["adapted"]]) == viewer.BANDS // 2
+    opened.shown.value = "frozen"
+    opened._apply()
+    assert visible(opened.bands[names["frozen"]]) == viewer.BANDS // 2
+    assert visible(opened.frusta[names["frozen"]]) == 4
+    assert visible(opened.frusta[names["adapted"]]) == 0
+    opened._swap()
+    assert opened.shown.value == "adapted"
+    before = opened.bands[names["adapted"]][-1].colors.copy()
+    opened.mode.value = "error"
+    opened._recolour()
+    assert not np.array_equal(before, opened.bands[names["adapted"]][-1].colors)
+
+
+def test_bands_hold_the_kept_points_by_confidence(opened):
+    layer = next(x for x in opened.layers if x.stage.key == "adapted")
+    points = np.concatenate([handle.points for handle in opened.bands[layer.name]])
+    kept = layer.stage.world_points()[layer.stage.keep]
+    assert np.allclose(np.sort(points, axis=0), np.sort(kept, axis=0))
+    ranges = {"depth": (1.0, 2.0), "confidence": (1.0, 2.0)}
+    _, _, order = viewer._banded(layer.stage, layer.result.images, ranges)
+    conf = layer.stage.conf[layer.stage.keep]
+    assert all(conf[a].max() <= conf[b].min() for a, b in itertools.pairwise(order))
+
+
+def test_cameras_are_handed_over_in_the_right_frame(opened):
+    stage = opened.layers[1].stage
+    quaternions, places = viewer.camera_poses(stage)
+    R = quat_xyzw_to_matrix(quat_wxyz_to_xyzw(torch.from_numpy(quaternions))).numpy()
+    for view in range(4):
+        T = stage.T_cam_world[view]
+        assert np.allclose(R[view].T, T[:3, :3], atol=1e-5)
+        assert np.allclose(T[:3, :3] @ places[view] + T[:3, 3], 0, atol=1e-5)
+
+
+def test_two_folders_are_compared_in_one_frame(example, tmp_path):
+    other = write_example(tmp_path / "other", hw=(24, 32), truth=False)
+    shown = viewer.open_viewer([example, other], port=free_port())
+    try:
+        labels = [layer.label for layer in shown.layers]
+        assert labels == [
+            "frozen (out)", "adapted (out)", "ground truth (out)", "frozen (other)", "adapted (other)",
+        ]  # fmt: skip
+        assert "error" not in shown.mode.options
+        first, second = shown.layers[1].stage, shown.layers[4].stage
+        assert np.allclose(first.T_cam_world, second.T_cam_world, atol=1e-3)
+    finally:
+        shown.close()
+
+
+def test_the_mesh_follows_its_points(tmp_path):
+    import trimesh
+
+    folder = write_example(tmp_path / "out", hw=(24, 32))
+    from freegeo.export.reconstruction import Reconstruction
+    from freegeo.report.result import Stage
+
+    own = Reconstruction.load(folder)
+    raw = Stage(
+        key="adapted", depth_z=own.depth_z, conf=own.conf, T_cam_world=own.T_cam_world, K=own.K, keep=own.conf > 0,
+        removed={},
+    )  # fmt: skip
+    corners = raw.world_points()[0][[0, 0, 5], [0, 5, 0]]
+    trimesh.Trimesh(corners, [[0, 1, 2]], process=False).export(folder / "mesh.ply")
+    shown = viewer.open_viewer([folder], port=free_port())
+    try:
+        layer = next(x for x in shown.layers if x.stage.key == "adapted")
+        mesh = viewer._mesh(layer)
+        assert np.allclose(mesh.vertices, layer.stage.world_points()[0][[0, 0, 5], [0, 5, 0]], atol=1e-4)
+        assert list(shown.meshes) == [layer.name]
+    finally:
+        shown.close()
+
+
+def test_a_port_in_use_is_one_sentence(example):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(UserError, match=f"port {port} on 127.0.0.1 cannot be used.*--port"):
+            viewer.open_viewer([example], port=port)
+
+
+def test_what_cannot_be_shown_is_refused(example, tmp_path):
+    with pytest.raises(UserError, match="--port must be"):
+        viewer.open_viewer([example], port=0)
+    with pytest.raises(UserError, match="--host"):
+        viewer.open_viewer([example], host="no.such.host.invalid", port=free_port())
+    with pytest.raises(UserError, match="holds no reconstruction"):
+        viewer.open_viewer([tmp_path], port=free_port())
+    dataclasses.replace(room(2), T_cam_world=None, K=None).save(tmp_path)
+    with pytest.raises(UserError, match="no cameras"):
+        viewer.open_viewer([tmp_path], port=free_port())
+    other = write_example(tmp_path / "other", hw=(24, 32), names=("another.jpg",))
+    with pytest.raises(UserError, match="other photos"):
+        viewer.open_viewer([example, other], port=free_port())
+
+
+class _Closed:
+    def close(self):
+        self.closed = True
+
+
+@pytest.mark.parametrize(("host", "warns"), [("127.0.0.1", False), ("0.0.0.0", True)])
+def test_the_command_says_where_to_look_and_warns(monkeypatch, capsys, tmp_path, host, warns):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    handle = _Closed()
+    monkeypatch.setattr(viewer, "open_viewer", lambda folders, host, port: handle)
+    monkeypatch.setattr(command, "wait", interrupted)
+    command.view(tmp_path, host=host, port=8123)
+    said = capsys.readouterr()
+    assert "http://localhost:8123" in said.out
+    assert ("no password" in said.err) == warns
+    assert ("ssh -L 8123:localhost:8123" in said.out) != warns
+    assert handle.closed
+    with pytest.raises(UserError, match="name one output folder"):
+        command.view()
