@@ -6,7 +6,7 @@ import logging
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.adapter_files import PAGE, load_adapter, save_adapter
 from freegeo.adaptation.bank import SceneImages
+from freegeo.adaptation.planner import choose_adaptation, plan_reconstruction
 from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
 from freegeo.adaptation.trainer import STATE_FILE, Adapted, Engine, Progress
 from freegeo.adaptation.trainer import adapt as train_adapter
@@ -148,6 +149,8 @@ class Job:
 
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
+        views, size = len(self.batch), image_hw(self.batch)
+        plan_reconstruction(self.model, views, size, device=self.engine.device, precision=self.engine.precision)
         frozen = None
         if self.recipe is not None:
             frozen = self._predicted(self.folder / FROZEN_FOLDER, "frozen prediction", self.reference)
@@ -184,9 +187,10 @@ class Job:
             return
         assert self.recipe is not None
         scene = SceneImages.from_batch("photos", self.batch)
+        engine = planned_engine(self.model, self.batch, self.recipe, seed=self.seed, engine=self.engine, folder=folder)
         with self._timed("adaptation"):
             result = train_adapter(
-                self.model, [scene], self.recipe, seed=self.seed, engine=self.engine, resume_in=folder,
+                self.model, [scene], self.recipe, seed=self.seed, engine=engine, resume_in=folder,
                 on_step=self.hooks.step,
             )  # fmt: skip
         self.in_place = result.adapter
@@ -248,6 +252,23 @@ class _Timed:
 
     def __exit__(self, *_) -> None:
         self.job.timings[self.stage] = time.monotonic() - self.started
+
+
+def image_hw(batch: ImageBatch) -> tuple[int, int]:
+    """Return height and width of a batch's images."""
+    return batch.images.shape[-2], batch.images.shape[-1]
+
+
+def planned_engine(
+    model: ReconstructionModel, batch: ImageBatch, recipe: Recipe, *, seed: int, engine: Engine, folder: Path
+) -> Engine:
+    """Return the engine with cache place, checkpointing and micro-batch chosen so that one scene's run fits.
+
+    On the CPU view sets go one by one, so that the result does not depend on how much memory happens to be free.
+    """
+    engine = replace(engine, cache_folder=folder)
+    chosen = choose_adaptation(model, [(len(batch), image_hw(batch))], recipe, seed=seed, engine=engine).engine
+    return replace(chosen, micro_batch=engine.micro_batch) if engine.device.type == "cpu" else chosen
 
 
 def loss_change(totals: Sequence[float]) -> dict[str, float]:

@@ -97,10 +97,11 @@ def test_bad_predictions_are_reported_and_no_metric_is_invented(data, out):
     result = evaluate_all(data, out, wanted=[good, far, lost, cut, missing])
 
     reasons = {problem.what: problem.reason for problem in result.problems}
-    assert len(reasons) == 5
+    assert len(reasons) == 6
     assert reasons["surface (4 views, seed 44, frozen)"] == EMPTY_SURFACE
     assert "not finite" in reasons["poses (4 views, seed 45, frozen)"]
     assert "NaN" in reasons["surface (4 views, seed 45, frozen)"]
+    assert "non-finite" in reasons["depth (4 views, seed 45, frozen)"]
     assert "damaged" in reasons["4 views, seed 46, frozen"]
     assert "no stored" in reasons["4 views, seed 47, frozen"]
     assert values(result, good)["fscore"] > 0.3
@@ -171,12 +172,6 @@ def test_pairs_share_scene_and_seed_and_scenes_are_drawn_whole():
 
 
 def test_lines_are_json(tmp_path):
-    row = Row(**dict.fromkeys(COLUMNS, "x") | {"views": 4, "frames": 4, "seed": 1, "value": 0.5})
-    _, lines = write_results(tmp_path, [row])
-    assert json.loads(lines.read_text()) == {
-        **dict.fromkeys(COLUMNS, "x"),
-        "views": 4,
-        "frames": 4,
-        "seed": 1,
-        "value": 0.5,
-    }
+    fields = dict.fromkeys(COLUMNS, "x") | {"views": 4, "frames": 4, "seed": 1, "value": 0.5}
+    _, lines = write_results(tmp_path, [Row(**fields)])
+    assert json.loads(lines.read_text()) == fields

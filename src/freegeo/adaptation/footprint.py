@@ -56,7 +56,8 @@ def shape_of(model: ReconstructionModel) -> Shape:
     part = model.adaptable()
     linears = [_base(part.get_submodule(name)) for name in part.adapter_targets()]
     attention = [linear for linear in linears if linear.out_features == 3 * linear.in_features]
-    width = attention[0].in_features
+    # A third-party model may have no joint qkv layer; its first layer then stands for its width.
+    width = (attention or linears)[0].in_features
     contraction = [linear for linear in linears if linear.out_features == width and linear.in_features != width]
     expansion = [linear for linear in linears if linear.in_features == width and linear.out_features > width]
     hidden = contraction[0].in_features if contraction else width
@@ -71,7 +72,7 @@ def shape_of(model: ReconstructionModel) -> Shape:
     return Shape(
         width=width,
         heads=max(1, width // 64),
-        blocks=len(attention),
+        blocks=max(1, len(attention)),
         hidden=hidden,
         gated=any(linear.out_features == 2 * hidden for linear in expansion),
         linear_parameters=sum(casts.values()),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -141,7 +141,7 @@ def depth_figure(panels: Sequence[DepthPanel], title: str) -> Figure:
 
 
 def cloud_figure(panels: Sequence[CloudPanel], truth: np.ndarray, threshold: float, title: str) -> Figure:
-    """Surfaces seen along the direction in which the truth (m, 3) is thinnest: grey inside, red beyond the threshold."""
+    """Surfaces seen along the thinnest direction of the truth (m, 3): grey inside, red beyond the threshold."""
     plt = _pyplot()
     centre, axes = _widest_plane(truth)
     figure, grid = plt.subplots(
@@ -209,7 +209,7 @@ def _comparisons(out: Path) -> Mapping[str, tuple[Task, Task]]:
     found: dict[str, tuple[Task, Task]] = {}
     for task in sorted(tasks, key=str):
         for kind, ((one, other), _) in PAIRS.items():
-            partner = Task(**{**task.__dict__, "variant": other})
+            partner = replace(task, variant=other)
             if task.variant == one and task.views == SHOWN_VIEWS and partner in tasks:
                 found.setdefault(f"{kind}-{task.dataset}", (task, partner))
     return found

@@ -241,15 +241,20 @@ def predict_all(
     problems = run_each(
         predictor.adapter_jobs(waiting),
         lambda job: predictor.adapt(job, partial(on_step, job)),
-        lambda job, error: Problem(
-            dataset=job.dataset, scene=_joined(job.scenes), stage="adapt", what=job.digest, reason=reason_of(error)
-        ),
+        adaptation_problem,
     )
     # One adapter after the other, and within it scene by scene, so that both are loaded once.
     ordered = sorted(waiting, key=lambda task: (task.dataset, _adapter_of(predictor, task)))
     problems += run_each(ordered, predictor.predict, problem_of("predict"), on_task)
     predictor.close()
     return problems
+
+
+def adaptation_problem(job: AdapterJob, error: BaseException) -> Problem:
+    """How a failed adaptation becomes a problem."""
+    return Problem(
+        dataset=job.dataset, scene=_joined(job.scenes), stage="adapt", what=job.digest, reason=reason_of(error)
+    )
 
 
 def problem_of(stage: Literal["predict", "evaluate"]) -> Callable[[Task, BaseException], Problem]:

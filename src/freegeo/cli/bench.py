@@ -25,8 +25,8 @@ DATA = Path("benchmark-data")
 PROBLEMS_FILE = "problems.json"
 TABLES = "tables"
 SHOWN_PROBLEMS = 20
-QUICK = {"rooms": 12, "seeds": (43,), "steps": 60}
-"""What --quick stands for: rooms of every split, frame seeds, optimiser steps of an adapter."""
+QUICK_SCENES, QUICK_SEEDS, QUICK_STEPS = 12, 1, 60
+"""What --quick stands for: scenes of every dataset, how many of an experiment's seeds, optimiser steps."""
 
 
 @Parameter(name="*")
@@ -49,7 +49,7 @@ class BenchOptions:
     frames: Literal["da3", "vggt", "experiment", "neighbours"] = "da3"
     """Frame rule of the model family, where the experiment has none of its own (docs/benchmark.md)."""
     quick: bool = False
-    """12 scenes of every dataset, seed 43, 60 steps of adaptation, unless given otherwise."""
+    """12 scenes of every dataset, an experiment's first seed, 60 steps of adaptation, unless given otherwise."""
 
 
 @Parameter(name="*")
@@ -218,7 +218,7 @@ def _prepare(
         raise UserError("name at least one experiment, or all; `freegeo bench list` lists them.")
     entries = chosen(experiments)
     names = _datasets(bench.datasets)
-    limit = bench.scenes or (QUICK["rooms"] if bench.quick else None)
+    limit = bench.scenes or (QUICK_SCENES if bench.quick else None)
     seeds = _numbers(bench.seeds, "--seeds")
     scenes = {name: listed_scenes(bench.data, name, limit) for name in names}
     tasks = [
@@ -226,10 +226,10 @@ def _prepare(
         for entry in entries
         for task in entry.tasks(
             {name: scenes[name] for name in datasets_of(entry, names)}, rule=bench.frames,
-            seeds=seeds or (entry.seeds[:1] if bench.quick else None), views=_numbers(bench.views, "--views"),
+            seeds=seeds or (entry.seeds[:QUICK_SEEDS] if bench.quick else None), views=_numbers(bench.views, "--views"),
         )
     ]  # fmt: skip
-    steps = model.steps or (QUICK["steps"] if bench.quick and model.epochs is None else None)
+    steps = model.steps or (QUICK_STEPS if bench.quick and model.epochs is None else None)
     predictor = Predictor(
         Setup(
             data=bench.data, out=bench.output, model=model.model, checkpoint=model.checkpoint, device=model.device,
@@ -257,24 +257,23 @@ def _predict(
         console.say(f"  {line}")
     if estimate_only:
         return []
-    with locked(bench.output):
+    with locked(bench.output), console.progress_bar("predicting", len(waiting)) as update:
+        done = 0
+
+        def on_task(task: Task) -> None:
+            nonlocal done
+            done += 1
+            update(done, str(task))
+
+        def on_step(job, progress) -> None:
+            if progress.step % 10 == 0 or progress.step + 1 == progress.steps:
+                update(done, f"adapting to {job.dataset}, step {progress.step + 1} of {progress.steps}")
+
         if cluster:
             from freegeo.benchmark.cluster import predict_on_cluster
 
-            return predict_on_cluster(predictor, tasks)
-        with console.progress_bar("predicting", len(waiting)) as update:
-            done = 0
-
-            def on_task(task: Task) -> None:
-                nonlocal done
-                done += 1
-                update(done, str(task))
-
-            def on_step(job, progress) -> None:
-                if progress.step % 10 == 0 or progress.step + 1 == progress.steps:
-                    update(done, f"adapting to {job.dataset}, step {progress.step + 1} of {progress.steps}")
-
-            return predict_all(predictor, tasks, on_step=on_step, on_task=on_task)
+            return predict_on_cluster(predictor, tasks, on_task=on_task)
+        return predict_all(predictor, tasks, on_step=on_step, on_task=on_task)
 
 
 def _evaluate(bench: BenchOptions, device: str | None, *, wanted: list[Task] | None) -> list[Problem]:

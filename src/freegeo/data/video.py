@@ -8,7 +8,7 @@ frame are decoded when they are asked for, so memory does not grow with length o
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -251,7 +251,7 @@ def _decoded(container: Any, path: Path) -> Iterator[Any]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _opened(path: Path) -> Generator[Any]:
     import av
     from av.error import FFmpegError
 

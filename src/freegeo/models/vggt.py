@@ -214,6 +214,10 @@ class VGGT(ReconstructionModel):
         """Name of the two learned tokens: first view, other views."""
         return "aggregator.camera_token"
 
+    def set_recompute(self, recompute: bool) -> None:
+        """Turn per-block activation checkpointing on or off."""
+        self.aggregator.recompute = recompute
+
     def adapter_targets(self) -> list[str]:
         """Return all linears of the frame and global blocks."""
         return [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -148,7 +148,7 @@ def _draw_cameras(axes: Any, stage: Stage, level: np.ndarray, length: float) -> 
 
 
 @contextmanager
-def _figure(width: float, height: float) -> Iterator[tuple[Any, Any]]:
+def _figure(width: float, height: float) -> Generator[tuple[Any, Any]]:
     """A figure and its axes, without background, whose ink is replaced by the page's colours."""
     import matplotlib as mpl
     from matplotlib.figure import Figure

@@ -101,10 +101,11 @@
       const u = width / 2 + scale * (x * right[0] + y * right[1] + z * right[2]);
       const v = height / 2 - scale * (x * up[0] + y * up[1] + z * up[2]);
       const splat = Math.min(Math.max(spread[widths[i]] / depth, 1), BIGGEST_SPLAT), half = splat / 2;
-      const left = Math.max(0, Math.round(u - half)), end = Math.min(width, Math.round(u + half) || 1);
       const top = Math.max(0, Math.round(v - half)), bottom = Math.min(height, Math.round(v + half) || 1);
-      const key = Math.log2(depth), colour = colours[i];
+      const key = Math.log2(depth), colour = colours[i], round = splat > 4;
       for (let row = top; row < bottom; row++) {
+        const reach = round ? Math.sqrt(Math.max(0, half * half - (row + 0.5 - v) ** 2)) : half;
+        const left = Math.max(0, Math.round(u - reach)), end = Math.min(width, Math.round(u + reach) || 1);
         for (let at = row * width + left, stop = row * width + end; at < stop; at++) {
           if (key < depths[at]) { depths[at] = key; pixels[at] = colour; }
         }
