@@ -25,7 +25,7 @@ DATA = Path("benchmark-data")
 PROBLEMS_FILE = "problems.json"
 TABLES = "tables"
 SHOWN_PROBLEMS = 20
-QUICK_SCENES, QUICK_SEEDS, QUICK_STEPS = 12, 1, 60
+QUICK_SCENES, QUICK_SEEDS, QUICK_STEPS = 10, 1, 60
 """What --quick stands for: scenes of every dataset, how many of an experiment's seeds, optimiser steps."""
 
 
@@ -49,7 +49,7 @@ class BenchOptions:
     frames: Literal["da3", "vggt", "experiment", "neighbours"] = "da3"
     """Frame rule of the model family, where the experiment has none of its own (docs/benchmark.md)."""
     quick: bool = False
-    """12 scenes of every dataset, an experiment's first seed, 60 steps of adaptation, unless given otherwise."""
+    """10 scenes of every dataset, an experiment's first seed, 60 steps of adaptation, unless given otherwise."""
 
 
 @Parameter(name="*")

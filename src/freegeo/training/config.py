@@ -51,12 +51,12 @@ class TrainConfig:
     """Muon, for the matrices of the blocks and the camera decoder."""
     other_lr: float = 1e-3
     """AdamW, for the backbone's embeddings, norms and biases."""
-    head_lr: float = 3e-4
+    head_lr: float = 4e-4
     """AdamW, for the dense head and the last linear layers. Their inputs have a large mean, so that a step moves all
     outputs of a layer together: at 2e-3 rectifiers died within a few hundred steps, and the answers were constant."""
     warmup_views: int = 6_000
     cooldown: float = 0.25
-    ema: float = 0.998
+    ema: float = 0.99
     clip: float = 1.0
     pairs_until: int = 25_000
     """Views before windows reach beyond 2 or 3 neighbouring frames."""
@@ -64,8 +64,8 @@ class TrainConfig:
     """Views before windows reach 8 views and stride 3."""
     small_until: int = 90_000
     """Views before the images reach their full size; at three quarters of it a view costs 40 % less."""
-    depth_views: int = 6
-    """Views that the dense head learns from in one step, one of each sample; it learns fastest and costs most."""
+    depth_views: int = 16
+    """Views that the dense head learns from in one step, at most one of each sample; six were too few."""
     ray_branch_every: int = 8
     """Steps between two updates of the ray branch, which learns on detached features."""
     weights: LossWeights = LossWeights()
