@@ -134,8 +134,9 @@ def depth_figure(panels: Sequence[DepthPanel], title: str) -> Figure:
     for axis in grid.flat:
         axis.set(xticks=[], yticks=[])
     assert depth_map is not None and error_map is not None
-    figure.colorbar(depth_map, ax=grid[1::2, :].ravel().tolist(), label="depth (m)", shrink=0.6)
-    figure.colorbar(error_map, ax=grid[2::2, :].ravel().tolist(), label="relative error", shrink=0.6, extend="max")
+    everywhere = grid.ravel().tolist()
+    figure.colorbar(depth_map, ax=everywhere, label="depth (m)", shrink=0.5)
+    figure.colorbar(error_map, ax=everywhere, label="relative error", shrink=0.5, extend="max")
     figure.suptitle(title, fontsize=11)
     return figure
 
@@ -148,18 +149,16 @@ def cloud_figure(panels: Sequence[CloudPanel], truth: np.ndarray, threshold: flo
         1, len(panels), figsize=(3.9 * len(panels), 4.2), layout="constrained", squeeze=False, sharex=True, sharey=True
     )
     ground = (truth - centre) @ axes
-    margin = 0.15 * np.ptp(ground, axis=0).max()
-    for axis, panel in zip(grid[0], panels, strict=True):
+    shown = [(panel.points - centre) @ axes for panel in panels]
+    low, high = _window(ground, shown)
+    for axis, panel, flat in zip(grid[0], panels, shown, strict=True):
         axis.scatter(*_thinned(ground).T, s=1, color=TRUTH, rasterized=True)
-        shown = (panel.points - centre) @ axes
         outside = panel.distance >= threshold
         for mask, colour in ((~outside, INSIDE), (outside, OUTSIDE)):
-            axis.scatter(*_thinned(shown[mask], outside.size).T, s=1, color=colour, rasterized=True)
-        axis.set_title(f"{panel.title}: {outside.mean():.0%} beyond {threshold:g} m", fontsize=10)
-        axis.set(
-            aspect="equal", xlabel="m", xlim=(ground[:, 0].min() - margin, ground[:, 0].max() + margin),
-            ylim=(ground[:, 1].min() - margin, ground[:, 1].max() + margin),
-        )  # fmt: skip
+            axis.scatter(*_thinned(flat[mask], outside.size).T, s=1, color=colour, rasterized=True)
+        share = f"{outside.mean():.0%} beyond {threshold:g} m" if outside.size else "no surface"
+        axis.set_title(f"{panel.title}: {share}", fontsize=10)
+        axis.set(aspect="equal", xlabel="m", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     handles = [
         plt.Line2D([], [], linestyle="", marker="o", color=colour, label=label)
         for colour, label in ((TRUTH, "ground truth"), (INSIDE, "within"), (OUTSIDE, "beyond the threshold"))
@@ -244,6 +243,17 @@ def _widest_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     centre = points.mean(axis=0)
     _, _, directions = np.linalg.svd(points - centre, full_matrices=False)
     return centre, directions[:2].T
+
+
+def _window(truth: np.ndarray, shown: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of what is drawn: the truth (m, 2) and most of the surfaces, at most a truth's width beyond it."""
+    size = np.ptp(truth, axis=0).max()
+    low, high = truth.min(axis=0), truth.max(axis=0)
+    surfaces = np.concatenate(list(shown))
+    if len(surfaces):
+        near, far = np.percentile(surfaces, [2, 98], axis=0)
+        low, high = np.minimum(low, np.maximum(near, low - size)), np.maximum(high, np.minimum(far, high + size))
+    return low - 0.1 * size, high + 0.1 * size
 
 
 def _thinned(points: np.ndarray, total: int | None = None) -> np.ndarray:

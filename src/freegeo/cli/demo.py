@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from freegeo.cli import console
-from freegeo.cli.jobs import run_job
+from freegeo.cli.jobs import run_job, save_frames
 from freegeo.cli.options import DemoModelOptions, OutputOptions, RecipeOptions
 from freegeo.cli.sources import DEMO_DOMAIN, demo_scene
 from freegeo.storage import read_json, write_json
@@ -56,7 +56,7 @@ def demo(
     target = OutputOptions(output=output, overwrite=overwrite)
 
     def add_scores(job: Job) -> None:
-        save_photos(scene, output / "photos")
+        save_frames(scene.photos, output / "photos")
         true_reconstruction(job, scene).save(output / "truth")
         write_json(output / SCORES_NAME, score_windows(job, scene))
 
@@ -64,17 +64,6 @@ def demo(
         scene.photos, loaded, model, target, command="demo", recipe=plan, extra_settings=extra, after=add_scores
     )  # fmt: skip
     report(read_json(output / SCORES_NAME), domain)
-
-
-def save_photos(scene: Scene, folder: Path) -> None:
-    """Write the photographs as PNG files."""
-    from PIL import Image
-
-    from freegeo.storage import atomic_path
-
-    for photo in scene.photos:
-        with atomic_path(folder / f"{Path(photo.name).stem}.png") as part:
-            Image.fromarray(photo.read()).save(part)
 
 
 def true_reconstruction(job: Job, scene: Scene) -> Reconstruction:

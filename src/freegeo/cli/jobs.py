@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from freegeo.types import PhotoLike
 
 DEFAULT_FILES = FileOptions()
+FRAMES_FOLDER = "images"
 FILES = {
     "report.html": "the page to look at first",
     "prediction.npz": "depth, confidence, cameras",
@@ -30,6 +31,7 @@ FILES = {
     "colmap": "COLMAP model with tracks",
     "transforms.json": "nerfstudio cameras",
     "depth": "16-bit depth images",
+    "images": "the frames of the video that were used",
     "reconstruction.json": "settings, timings, versions, licence of the weights",
 }
 
@@ -76,6 +78,7 @@ def run_job(
 
     `after` writes more before the folder counts as finished.
     """
+    from freegeo.data.video import VideoFrame
     from freegeo.pipeline import Job, require_enough_photos, settings_of
 
     if recipe is not None:
@@ -97,6 +100,7 @@ def run_job(
         if folder.finished:
             say_finished(output.output, folder.finished_at)
             return
+        save_frames([photo for photo in photos if isinstance(photo, VideoFrame)], folder / FRAMES_FOLDER)
         job = Job(
             model=model, batch=batch, folder=folder, recipe=recipe, adapter=adapter, seed=model_options.seed,
             engine=model_options.engine(), hooks=hooks, reference=model_options.reference,
@@ -104,6 +108,19 @@ def run_job(
             masks=masks,
         )  # fmt: skip
         describe(job.run(), output.output)
+
+
+def save_frames(photos: Sequence[PhotoLike], folder: Path) -> None:
+    """Write photos that are in no file of their own as PNG, under the names that exports refer to."""
+    from PIL import Image
+
+    from freegeo.storage import atomic_path
+
+    for photo in photos:
+        path = folder / f"{Path(photo.name).stem}.png"
+        if not path.is_file():
+            with atomic_path(path) as part:
+                Image.fromarray(photo.read()).save(part)
 
 
 def adapter_identity(folder: Path) -> dict[str, str]:
