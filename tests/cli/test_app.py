@@ -87,7 +87,7 @@ def test_config_sets_options_and_the_command_line_wins(caught, tmp_path):
     file = config(tmp_path, '[run]\nmodel = "da3-large"\nsteps = 5\nmax-views = 7\nrank = 4\n[adapt]\nsteps = 9\n')
     assert main(["run", "x", "-o", "out", "--config", file, "--rank", "8"]) == 0
     (sources, limit), ((_, _, model, output), options) = caught
-    assert (sources, limit) == (("x",), 7)
+    assert (sources, limit.max_views) == (("x",), 7)
     assert model.model == "da3-large"
     assert str(output.output) == "out"
     assert (options["recipe"].steps, options["recipe"].rank) == (5, 8)
