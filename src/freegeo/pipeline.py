@@ -127,6 +127,8 @@ class Job:
     folder: RunFolder
     recipe: Recipe | None
     """None: reconstruct with the frozen model, or with `adapter`."""
+    scene: SceneImages | None = None
+    """Images to adapt to, where the recipe reads them otherwise than `batch` has them."""
     adapter: Path | None = None
     """A saved adapter to reconstruct with, instead of training one."""
     seed: int = SEED
@@ -186,7 +188,7 @@ class Job:
             self.in_place = load_adapter(self.model, folder)
             return
         assert self.recipe is not None
-        scene = SceneImages.from_batch("photos", self.batch)
+        scene = self.scene or SceneImages.from_batch("photos", self.batch)
         engine = planned_engine(self.model, self.batch, self.recipe, seed=self.seed, engine=self.engine, folder=folder)
         with self._timed("adaptation"):
             result = train_adapter(

@@ -96,6 +96,17 @@ def test_a_damaged_scene_is_named_and_the_others_are_scored(freegeo, options, tm
     assert ROOMS[0] in (tmp_path / "out" / "results.csv").read_text()
 
 
+def test_a_run_without_any_readable_scene_says_so(freegeo, options, tmp_path):
+    for room in ROOMS:
+        path = tmp_path / "data" / DATASET / f"{room}.npz"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"PK")
+        path.with_suffix(".ply").write_bytes(b"ply")
+    code, _, err = freegeo("run", "long-sequence", *options)
+    assert code == 1
+    assert "of 2 scenes" in err.splitlines()[-1]
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

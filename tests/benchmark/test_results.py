@@ -5,17 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bench_tools import DATASET, ROOMS, task
+from bench_tools import CONFIGURATION, DATASET, ROOMS, store_truth, task
 from freegeo.benchmark.results import COLUMNS, Row, choose, paired, read_results, rows_of, write_results
 from freegeo.benchmark.score import EMPTY_SURFACE, evaluate_all
-from freegeo.benchmark.stored import write_stored
-from freegeo.benchmark.tasks import PREDICTION_FILE, choose_frames, finish
+from freegeo.benchmark.tasks import PREDICTION_FILE, finish
 from freegeo.data.datasets import load_scene
 from freegeo.errors import UserError
 from freegeo.storage import write_json
-from freegeo.types import Prediction
-
-CONFIGURATION = {"model": "tiny", "checkpoint": None, "precision": "fp32", "adaptation": None}
 
 
 @pytest.fixture
@@ -26,19 +22,6 @@ def out(tmp_path, small_rooms):
 @pytest.fixture
 def data(tmp_path):
     return tmp_path / "data"
-
-
-def store_truth(data, out, one, configuration=CONFIGURATION, **changes):
-    """Store exact depth and cameras of a room, in another frame and scale, as a task's prediction."""
-    scene = load_scene(data, one.dataset, one.scene)
-    frames = choose_frames(one.rule, len(scene), one.views, one.seed)
-    chosen = scene.select(frames)
-    T = chosen.T_cam_world.clone()
-    T[:, :3, 3] /= 2
-    prediction = Prediction(**{"depth_z": chosen.depth_z / 2, "T_cam_world": T, "K": chosen.K, **changes})
-    write_stored(one, out, prediction, frames)
-    finish(one, out, configuration, frames=frames, seconds=0.5, peak_gb=1.0, adapter=None)
-    return prediction
 
 
 def values(result, one):

@@ -13,7 +13,7 @@ def small_shards(monkeypatch):
     monkeypatch.setattr(pool, "ROOMS_PER_SHARD", ROOMS)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def small_config():
     return TrainConfig(views=40, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1)
 

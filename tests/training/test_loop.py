@@ -1,7 +1,9 @@
 import os
+import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +12,7 @@ from safetensors import safe_open
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.models.catalog import load_model
 from freegeo.storage import read_json
-from freegeo.training import loop, state
+from freegeo.training import loop, pool, state
 from freegeo.training.loop import train
 
 pytestmark = pytest.mark.usefixtures("small_shards")
@@ -35,9 +37,12 @@ def tensors(path):
         return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
 
 
-@pytest.fixture
-def whole_run(tmp_path, small_config):
-    return train(small_config, tmp_path / "whole")
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory, small_config):
+    """A run that was never stopped; read only."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pool, "ROOMS_PER_SHARD", 2)
+        return train(small_config, tmp_path_factory.mktemp("whole"))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
@@ -54,9 +59,8 @@ def test_a_killed_run_ends_with_the_same_tensors(tmp_path, small_config, whole_r
 
 
 def test_a_larger_budget_goes_on_from_the_plateau(tmp_path, small_config, whole_run):
-    from dataclasses import replace
-
-    folder = whole_run.parent
+    folder = tmp_path / "larger"
+    shutil.copytree(whole_run.parent, folder)
     plateau = torch.load(folder / state.PLATEAU, weights_only=True)
     assert 30 <= plateau["counters"][1] < 40
     steps = []
@@ -68,8 +72,6 @@ def test_a_larger_budget_goes_on_from_the_plateau(tmp_path, small_config, whole_
 
 
 def test_other_settings_need_another_folder(small_config, whole_run):
-    from dataclasses import replace
-
     with pytest.raises(UserError, match="another seed"):
         train(replace(small_config, seed=7), whole_run.parent)
 

@@ -10,8 +10,12 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from freegeo.types import ImageBatch
+from freegeo.adaptation.recipe import Recipe
+from freegeo.errors import UserError
+from freegeo.models.api import ReconstructionModel
+from freegeo.types import ImageBatch, PhotoLike
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +35,34 @@ class SceneImages:
     def from_batch(cls, name: str, batch: ImageBatch) -> SceneImages:
         """Use images that are already at the model's size."""
         return cls(name=name, count=len(batch), load=lambda frames: batch.images[list(frames)], in_memory=True)
+
+    @classmethod
+    def from_photos(
+        cls, name: str, photos: Sequence[PhotoLike], model: ReconstructionModel, recipe: Recipe
+    ) -> SceneImages:
+        """Decode photos on demand, as the model reads them or squashed as the recipe asks.
+
+        UserError when the recipe's square is no whole number of the model's patches.
+        """
+        if recipe.squash is not None and recipe.squash % model.spec.patch_size:
+            raise UserError(
+                f"recipe '{recipe.name}' squashes images to {recipe.squash} pixels; {model.spec.name} cannot read them "
+                f"(patches of {model.spec.patch_size}). Choose another recipe."
+            )
+
+        def load(frames: Sequence[int]) -> Tensor:
+            chosen = [photos[frame] for frame in frames]
+            if recipe.squash is None:
+                return model.preprocess(chosen).images
+            return torch.cat([squashed(torch.from_numpy(photo.read()), recipe.squash) for photo in chosen])
+
+        return cls(name=name, count=len(photos), load=load)
+
+
+def squashed(pixels_HW3: Tensor, side: int) -> Tensor:
+    """Resize a photo bilinearly to a square (1, 3, side, side) in [0, 1], whatever its aspect."""
+    image = pixels_HW3.permute(2, 0, 1)[None].float() / 255
+    return F.interpolate(image, size=(side, side), mode="bilinear", align_corners=False)
 
 
 def released_augmentation(images: Tensor, seed: int, positions: Sequence[int] | None = None) -> Tensor:

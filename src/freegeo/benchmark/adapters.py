@@ -20,8 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
-from torch import Tensor
 
 from freegeo.adaptation.adapter import Adapter, count_trainable
 from freegeo.adaptation.adapter_files import load_adapter, save_adapter
@@ -32,7 +30,6 @@ from freegeo.adaptation.trainer import STATE_FILE, Adapted, Progress, adapt
 from freegeo.adaptation.views import schedule
 from freegeo.benchmark.tasks import DAMAGED, Problem, plain, reason_of
 from freegeo.data.datasets import load_scene
-from freegeo.data.scene import Scene
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.models.api import ReconstructionModel
 from freegeo.storage import read_json, write_json
@@ -137,18 +134,6 @@ def trained_epochs(job: AdapterJob, out: Path) -> list[int]:
     return sorted(int(path.name.removeprefix("epoch-")) for path in job.folder(out).glob("epoch-*"))
 
 
-def scene_images(model: ReconstructionModel, scene: Scene, recipe: Recipe, name: str) -> SceneImages:
-    """The scene's photos as adaptation reads them, decoded on demand."""
-
-    def load(frames: Sequence[int]) -> Tensor:
-        photos = [scene.photos[frame] for frame in frames]
-        if recipe.squash is None:
-            return model.preprocess(photos).images
-        return torch.cat([_squashed(torch.from_numpy(photo.read()), recipe.squash) for photo in photos])
-
-    return SceneImages(name=name, count=len(scene), load=load)
-
-
 def reset_peak_memory(device: torch.device) -> None:
     """Start to measure the device's peak memory anew; that of the process on a CPU cannot be reset."""
     if device.type == "cuda":
@@ -174,7 +159,7 @@ def _usable_scenes(job: AdapterJob, model: ReconstructionModel, data: Path) -> t
             scene = load_scene(data, job.dataset, name)
             if len(scene) < SMALLEST_SCENE:
                 raise FreeGeoError(f"{len(scene)} frames are too few to adapt to; {SMALLEST_SCENE} are needed")
-            scenes.append(scene_images(model, scene, job.recipe, name))
+            scenes.append(SceneImages.from_photos(name, scene.photos, model, job.recipe))
         except DAMAGED as error:
             problems.append(
                 Problem(dataset=job.dataset, scene=name, stage="adapt", what="the scene", reason=reason_of(error))
@@ -195,8 +180,3 @@ def _facts(result: Adapted, model: ReconstructionModel, recipe: Recipe, peak_gb:
         "first_loss": sum(totals[:tenth]) / tenth,
         "last_loss": sum(totals[-tenth:]) / tenth,
     }
-
-
-def _squashed(pixels: Tensor, side: int) -> Tensor:
-    image = pixels.permute(2, 0, 1)[None].float() / 255
-    return F.interpolate(image, size=(side, side), mode="bilinear", align_corners=False)

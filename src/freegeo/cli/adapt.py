@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from freegeo.cli import console
-from freegeo.cli.jobs import progress_hooks, say_finished
+from freegeo.cli.jobs import progress_hooks, say_finished, squashed_scene
 from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source, split_scenes
 
@@ -22,6 +22,7 @@ FILES = {
     "camera_token.safetensors": "adapted camera token",
     "freegeo.json": "base model, recipe, seed, scenes, loss curve",
     "epochs": "the adapter after every epoch",
+    "published": "the adapter in the authors' layout",
 }
 
 
@@ -31,6 +32,7 @@ def adapt(
     model: ModelOptions = DEFAULT_MODEL,
     recipe: RecipeOptions = DEFAULT_RECIPE,
     photos: PhotoOptions = DEFAULT_PHOTOS,
+    published: bool = False,
 ) -> None:
     """Adapt a model to scenes; several folders make one adapter for all of them.
 
@@ -38,6 +40,8 @@ def adapt(
     ----------
     sources
         Folders of photos (each a scene), globs in quotes, photo files (together one scene), videos, or `demo`.
+    published
+        Also write the adapter in the layout of the authors' release, below `published`.
     """
     from freegeo.adaptation.bank import SceneImages
     from freegeo.pipeline import require_enough_photos, settings_of
@@ -50,22 +54,32 @@ def adapt(
     plan = recipe.build(loaded.spec)
     batches = {name: loaded.preprocess(found) for name, found in scenes.items()}
     about = {name: {"photos": list(batch.names), "contents": batch.digest()} for name, batch in batches.items()}
-    settings = settings_of(plan, command="adapt", scenes=about, **model.settings(loaded))
+    settings = settings_of(plan, command="adapt", scenes=about, published=published, **model.settings(loaded))
     check_folder(output.output, settings, overwrite=output.overwrite)
-    images = [SceneImages.from_batch(name, batch) for name, batch in batches.items()]
+    images = [
+        squashed_scene(scenes[name], loaded, plan) or SceneImages.from_batch(name, batch)
+        for name, batch in batches.items()
+    ]
     with run_folder(output.output, settings, overwrite=output.overwrite) as folder:
         if folder.finished:
             say_finished(output.output, folder.finished_at)
             return
-        _train(loaded, images, plan, model, folder.path)
+        _train(loaded, images, plan, model, folder.path, published=published)
         folder.finish()
     console.written(output.output, FILES)
 
 
 def _train(
-    loaded: ReconstructionModel, images: list[SceneImages], plan: Recipe, model: ModelOptions, folder: Path
+    loaded: ReconstructionModel,
+    images: list[SceneImages],
+    plan: Recipe,
+    model: ModelOptions,
+    folder: Path,
+    *,
+    published: bool,
 ) -> None:
     from freegeo.adaptation.adapter_files import save_adapter
+    from freegeo.adaptation.published import export_published
     from freegeo.adaptation.trainer import STATE_FILE
     from freegeo.adaptation.trainer import adapt as train_adapter
     from freegeo.pipeline import loss_change
@@ -83,6 +97,8 @@ def _train(
             on_epoch=keep_epoch,
         )  # fmt: skip
     save_adapter(result.adapter, folder, result.page(names))
+    if published:
+        export_published(result.adapter, folder / "published")
     (folder / STATE_FILE).unlink(missing_ok=True)
     change = loss_change([terms["total"] for terms in result.curve])
     console.say(f"adaptation loss {change['first']:.4f} -> {change['last']:.4f} in {result.seconds:.0f} s")

@@ -193,11 +193,16 @@ def run(
     figures
         Draw the figures too.
     """
+    from freegeo.benchmark.tasks import stored_tasks
+
     predictor, tasks = _prepare(experiments, bench, model, overwrite)
     problems = _predict(predictor, tasks, bench, cluster=cluster)
-    failed = {(problem.dataset, problem.scene) for problem in problems}
     # What could not be predicted is known already; it shall not be reported twice.
-    wanted = [task for task in tasks if (task.dataset, task.scene) not in failed]
+    stored = {task for task, _ in stored_tasks(bench.output)}
+    wanted = [task for task in tasks if task in stored]
+    if not wanted:
+        _require_none(problems, bench.output)
+        return
     problems += _evaluate(bench, model.device, wanted=wanted)
     _tables(experiments, bench)
     if figures:

@@ -13,6 +13,7 @@ from freegeo.cli.options import ModelOptions, OutputOptions
 from freegeo.storage import check_folder, run_folder
 
 if TYPE_CHECKING:
+    from freegeo.adaptation.images import SceneImages
     from freegeo.adaptation.recipe import Recipe
     from freegeo.models.api import ReconstructionModel
     from freegeo.pipeline import Hooks, Job
@@ -105,9 +106,20 @@ def run_job(
             model=model, batch=batch, folder=folder, recipe=recipe, adapter=adapter, seed=model_options.seed,
             engine=model_options.engine(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), after=after, formats=files.formats, filters=files.filters.settings(),
-            masks=masks,
+            masks=masks, scene=squashed_scene(photos, model, recipe),
         )  # fmt: skip
         describe(job.run(), output.output)
+
+
+def squashed_scene(
+    photos: Sequence[PhotoLike], model: ReconstructionModel, recipe: Recipe | None
+) -> SceneImages | None:
+    """Return the images of a recipe that has its own way to resize them."""
+    from freegeo.adaptation.images import SceneImages
+
+    if recipe is None or recipe.squash is None:
+        return None
+    return SceneImages.from_photos("photos", photos, model, recipe)
 
 
 def save_frames(photos: Sequence[PhotoLike], folder: Path) -> None:
