@@ -40,7 +40,13 @@ class Photo:
         from PIL import ImageOps
 
         with _opened(self.path) as image:
-            return np.array(_to_rgb(ImageOps.exif_transpose(image)))
+            pixels = np.array(_to_rgb(ImageOps.exif_transpose(image)))
+        if pixels.shape[:2] != self.size_hw:
+            raise UserError(
+                f"{self.path}: the image is damaged (its header says {self.size_hw[1]} x {self.size_hw[0]} pixels, "
+                f"it has {pixels.shape[1]} x {pixels.shape[0]}). Replace it or take it out."
+            )
+        return pixels
 
 
 def load_photos(source: str | Path | Sequence[str | Path], max_views: int = MAX_VIEWS) -> list[Photo]:
