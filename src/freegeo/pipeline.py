@@ -151,7 +151,7 @@ class Job:
 
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
-        views, size = len(self.batch), image_hw(self.batch)
+        views, size = len(self.batch), self.batch.image_hw
         plan_reconstruction(self.model, views, size, device=self.engine.device, precision=self.engine.precision)
         frozen = None
         if self.recipe is not None:
@@ -256,11 +256,6 @@ class _Timed:
         self.job.timings[self.stage] = time.monotonic() - self.started
 
 
-def image_hw(batch: ImageBatch) -> tuple[int, int]:
-    """Return height and width of a batch's images."""
-    return batch.images.shape[-2], batch.images.shape[-1]
-
-
 def planned_engine(
     model: ReconstructionModel, batch: ImageBatch, recipe: Recipe, *, seed: int, engine: Engine, folder: Path
 ) -> Engine:
@@ -269,7 +264,7 @@ def planned_engine(
     On the CPU view sets go one by one, so that the result does not depend on how much memory happens to be free.
     """
     engine = replace(engine, cache_folder=folder)
-    chosen = choose_adaptation(model, [(len(batch), image_hw(batch))], recipe, seed=seed, engine=engine).engine
+    chosen = choose_adaptation(model, [(len(batch), batch.image_hw)], recipe, seed=seed, engine=engine).engine
     return replace(chosen, micro_batch=engine.micro_batch) if engine.device.type == "cpu" else chosen
 
 

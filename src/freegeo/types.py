@@ -57,6 +57,11 @@ class ImageBatch:
         """Return the number of views."""
         return len(self.names)
 
+    @property
+    def image_hw(self) -> tuple[int, int]:
+        """Height and width of the images."""
+        return self.images.shape[-2], self.images.shape[-1]
+
     def select(self, views: Sequence[int]) -> Self:
         """Return the chosen views, in the order given."""
         index = torch.as_tensor(list(views), dtype=torch.long)

@@ -73,8 +73,7 @@ def true_reconstruction(job: Job, scene: Scene) -> Reconstruction:
     from freegeo.types import Prediction
 
     assert scene.depth_z is not None and scene.K is not None
-    size = (job.batch.images.shape[-2], job.batch.images.shape[-1])
-    depth_z, K = at_size(scene.depth_z, scene.K, size)
+    depth_z, K = at_size(scene.depth_z, scene.K, job.batch.image_hw)
     return Reconstruction.from_prediction(Prediction(depth_z=depth_z, T_cam_world=scene.T_cam_world, K=K), job.batch)
 
 
