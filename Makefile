@@ -27,7 +27,7 @@ parity: $(READY)
 	cd tests && OMP_NUM_THREADS=1 ../$(BIN)/python parity.py
 
 lint: $(READY)
-	$(BIN)/ruff check
+	$(BIN)/ruff check --no-cache
 	$(BIN)/ruff format --check
 	$(BIN)/ty check
 

@@ -4,10 +4,10 @@ import io
 import sys
 from pathlib import Path
 
-from conftest import ARGUMENTS, CHROMIUM
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
+from conftest import ARGUMENTS, CHROMIUM
 from freegeo.report.page import write_report
 from freegeo.report.viewer import open_viewer
 
