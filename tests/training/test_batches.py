@@ -71,7 +71,7 @@ def test_a_mirrored_sample_is_still_one_world(rooms):
 
 def test_stages_grow_longer_and_larger():
     config = TrainConfig()
-    stages = [config.stage(seen) for seen in (0, 30_000, 70_000, 200_000)]
+    stages = [config.stage(seen) for seen in (0, 30_000, 70_000, 300_000)]
     assert [max(stage.views) for stage in stages] == sorted(max(stage.views) for stage in stages)
     assert [stage.side for stage in stages] == [48, 48, 48, 64]
 

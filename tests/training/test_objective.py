@@ -12,6 +12,7 @@ from freegeo.training.config import TrainConfig
 from freegeo.training.objective import (
     Choice,
     camera_terms,
+    cell_depth_term,
     cell_targets,
     depth_terms,
     geometry_terms,
@@ -95,6 +96,16 @@ def test_true_rays_and_points_cost_nothing(batch):
     assert max(rays, points) < 1e-5
 
 
+def test_true_cell_depth_costs_nothing(batch):
+    h, w = (n // 8 for n in batch.images.shape[-2:])
+    log_depth = batch.depth_z[..., 1::2, 1::2].log()  # B S 4h 4w
+    tokens = log_depth.unflatten(2, (h, 4)).unflatten(4, (w, 4)).transpose(3, 4).flatten(4).flatten(2, 3)
+    right = SimpleNamespace(log_depth=lambda _: tokens)
+    assert cell_depth_term(right, features_of(batch), batch) < 1e-5
+    off = SimpleNamespace(log_depth=lambda _: tokens + 0.1)
+    torch.testing.assert_close(cell_depth_term(off, features_of(batch), batch), torch.tensor(0.1))
+
+
 def test_true_depth_has_no_error_and_confidence_no_pull_on_depth(batch):
     depth = batch.depth_z[:, :1].clone().requires_grad_()
     model = SimpleNamespace(decode=lambda features, want: Prediction(depth_z=depth, conf=2 * torch.ones_like(depth)))
@@ -103,7 +114,7 @@ def test_true_depth_has_no_error_and_confidence_no_pull_on_depth(batch):
     off = (batch.depth_z[:, :1] * 1.1).requires_grad_()
     model = SimpleNamespace(decode=lambda features, want: Prediction(depth_z=off, conf=2 * torch.ones_like(off)))
     terms = depth_terms(model, features_of(batch), batch.depth_z[:, :1], TrainConfig())
-    torch.testing.assert_close(terms["depth"], torch.tensor(1.1).log())
+    torch.testing.assert_close(terms["depth"], TrainConfig().weights.depth * torch.tensor(1.1).log())
     assert not terms["confidence"].requires_grad
 
 

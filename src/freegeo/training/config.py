@@ -9,12 +9,13 @@ from dataclasses import dataclass
 class LossWeights:
     """Weights of the training objective (embedded-model spec, section 4)."""
 
-    depth: float = 1.0
+    depth: float = 2.0
+    cell_depth: float = 2.0
     gradient: float = 0.5
     rotation: float = 3.0
     translation: float = 1.0
     absolute: float = 0.5
-    field_of_view: float = 2.0
+    field_of_view: float = 4.0
     rays: float = 2.0
     points: float = 2.0
     matching: float = 0.3
@@ -38,13 +39,13 @@ class Stage:
 class TrainConfig:
     """Train the embedded model on generated rooms."""
 
-    views: int = 1_000_000
+    views: int = 400_000
     """Views the model learns from, counted with repetition; the last `cooldown` of them lower the learning rate."""
     seed: int = 0
     side: int = 64
     """Longest image side in pixels."""
-    views_per_step: int = 32
-    rooms: int = 3_072
+    views_per_step: int = 48
+    rooms: int = 6_144
     """Rooms in the pool; they are rendered a shard at a time while training goes on."""
     frames: int = 10
     matrix_lr: float = 4e-3
@@ -62,10 +63,12 @@ class TrainConfig:
     """Views before windows reach beyond 2 or 3 neighbouring frames."""
     short_until: int = 60_000
     """Views before windows reach 8 views and stride 3."""
-    small_until: int = 90_000
+    small_until: int = 240_000
     """Views before the images reach their full size; at three quarters of it a view costs 40 % less."""
-    depth_views: int = 16
-    """Views that the dense head learns from in one step, at most one of each sample; six were too few."""
+    depth_views: int = 8
+    """Views that the dense head learns from in one step, at most one of each sample."""
+    head_steps: int = 300
+    """Steps at the end in which the dense head alone learns, from every view, on features that stay as they are."""
     ray_branch_every: int = 8
     """Steps between two updates of the ray branch, which learns on detached features."""
     weights: LossWeights = LossWeights()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import torch
@@ -14,6 +13,7 @@ from freegeo.training.objective import Choice, depth_terms, ray_branch_term
 from freegeo.training.pool import Pool
 from freegeo.types import Features
 
+LR = 8e-4
 WARMUP_STEPS = 10
 
 
@@ -22,31 +22,27 @@ def train_head(
     pool: Pool,
     config: TrainConfig,
     *,
-    minutes: float,
-    lr: float = 1e-3,
     progress: Callable[[int, dict[str, float]], None] = lambda step, terms: None,
-) -> int:
-    """Train the dense head in place for some minutes, the rate falling to zero; return the steps taken.
+) -> None:
+    """Train the dense head in place for `head_steps` steps, the rate falling to zero.
 
     A step decodes all its views and needs no backward pass through the backbone, so depth gets several times as many
     examples for the same processor time as during the run, where the head sees `depth_views` views a step.
     """
     parameters = list(model.head.requires_grad_().parameters())
-    adamw = torch.optim.AdamW(parameters, lr=lr, weight_decay=0.01, fused=True)
-    started, step = time.monotonic(), 0
-    while (spent := (time.monotonic() - started) / (60 * minutes)) < 1:
-        adamw.param_groups[0]["lr"] = lr * min(1.0, (step + 1) / WARMUP_STEPS) * (1 - spent)
+    device = parameters[0].device
+    adamw = torch.optim.AdamW(parameters, lr=LR, weight_decay=0.01, fused=True)
+    for step in range(config.head_steps):
+        adamw.param_groups[0]["lr"] = LR * min(1.0, (step + 1) / WARMUP_STEPS) * (1 - step / config.head_steps)
         generator = torch.Generator().manual_seed(config.seed * 1_000_003 - 1 - step)
-        batch = draw_batch(pool, config, config.views, generator)
+        batch = draw_batch(pool, config, config.views, generator, device)
         terms = head_terms(model, batch, config, step)
         adamw.zero_grad(set_to_none=True)
         torch.stack(list(terms.values())).sum().backward()
         torch.nn.utils.clip_grad_norm_(parameters, config.clip)
         adamw.step()
-        step += 1
-        progress(step, {name: float(value.detach()) for name, value in terms.items()})
+        progress(step + 1, {name: float(value.detach()) for name, value in terms.items()})
     model.head.requires_grad_(False)
-    return step
 
 
 def head_terms(model: DA3, batch: Batch, config: TrainConfig, step: int) -> dict[str, torch.Tensor]:

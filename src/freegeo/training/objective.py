@@ -19,6 +19,8 @@ from freegeo.training.config import TrainConfig
 from freegeo.types import Features
 
 CELLS = 2
+DEPTH_CELLS = 4
+"""Cells along a patch's side whose depth a linear map must know: depth for every view at the price of one product."""
 MATCH_WIDTH = 64
 MATCH_LEVELS = (0, 2)
 """Output levels whose patches are asked for their partners, the first one because the later ones build on it."""
@@ -40,6 +42,7 @@ class ReadOuts(nn.Module):
     def __init__(self, channels: int):
         super().__init__()
         self.geometry = nn.Linear(channels, CELLS**2 * 9)
+        self.log_depth = nn.Linear(channels, DEPTH_CELLS**2)
         self.reference_position = nn.ModuleList(nn.Linear(channels, 2) for _ in POSITION_LEVELS)
         self.descriptors = nn.ModuleList(nn.Linear(channels, MATCH_WIDTH) for _ in MATCH_LEVELS)
 
@@ -94,6 +97,7 @@ def objective(
     geometry = geometry_terms(read_outs, features, batch)
     terms["rays"] = weights.rays * geometry[0]
     terms["points"] = weights.points * geometry[1]
+    terms["cell_depth"] = weights.cell_depth * cell_depth_term(read_outs, features, batch)
     terms["matching"] = weights.matching * matching_term(read_outs, features, batch)
     terms["position"] = weights.position * position_term(read_outs, features, batch)
     samples, views = batch.images.shape[:2]
@@ -173,13 +177,27 @@ def geometry_terms(read_outs: ReadOuts, features: Features, batch: Batch) -> tup
     patch = batch.images.shape[-1] // features.grid_hw[1]
     targets = cell_targets(batch, patch // CELLS)
     tokens = features.levels[max(features.levels)][0]
-    h, w = features.grid_hw
-    values = read_outs.geometry(tokens).view(*tokens.shape[:2], h, w, CELLS, CELLS, 9)
-    values = values.permute(0, 1, 2, 4, 3, 5, 6).flatten(4, 5).flatten(2, 3)
+    values = spread(read_outs.geometry(tokens), features.grid_hw, CELLS)
     direction, origin, point = values.split(3, dim=-1)
     origin_true = batch.T_world_cam[:, :, None, None, :3, 3]
     rays = (direction - targets.direction).abs().mean() + (origin - origin_true).abs().mean()
     return rays / 2, (point - targets.point).abs().mean()
+
+
+def spread(values: Tensor, grid_hw: tuple[int, int], cells: int) -> Tensor:
+    """Lay out what each patch says about its cells (B, S, P, cells^2 c) as an image (B, S, rows, columns, c)."""
+    h, w = grid_hw
+    by_patch = values.view(*values.shape[:2], h, w, cells, cells, -1)
+    return by_patch.permute(0, 1, 2, 4, 3, 5, 6).flatten(4, 5).flatten(2, 3)
+
+
+def cell_depth_term(read_outs: ReadOuts, features: Features, batch: Batch) -> Tensor:
+    """Compare the log depth that a linear map reads off the last features, in every view."""
+    tokens = features.levels[max(features.levels)][0]
+    log_depth = spread(read_outs.log_depth(tokens), features.grid_hw, DEPTH_CELLS)[..., 0]
+    cell = batch.depth_z.shape[-1] // log_depth.shape[-1]
+    middle = cell // 2
+    return (log_depth - batch.depth_z[..., middle::cell, middle::cell].log()).abs().mean()
 
 
 def given(part: Tensor | None) -> Tensor:

@@ -158,11 +158,11 @@ def build_optimisers(model: DA3, read_outs: ReadOuts, config: TrainConfig) -> tu
 
 
 def averaged(state: State) -> DA3:
-    """Return a model with the averaged weights, on the CPU."""
+    """Return a model of its own with the averaged weights, on the CPU."""
     model = cast(DA3, build_empty(EMBEDDED_MODEL))
     aliases = {alias: state.average[stored] for alias, stored in keys().aliases.items()}
     weights = state.model.state_dict() | state.average | aliases
-    model.load_state_dict({name: value.cpu() for name, value in weights.items()}, assign=True)
+    model.load_state_dict({name: value.cpu().clone() for name, value in weights.items()}, assign=True)
     return model.requires_grad_(False).eval()
 
 
