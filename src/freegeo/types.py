@@ -204,6 +204,10 @@ class Cameras:
     K: Tensor
     """(..., S, 3, 3), pixels of the images they travel with."""
 
+    def to(self, device: torch.device | str) -> Self:
+        """Return the cameras on a device."""
+        return replace(self, T_cam_world=self.T_cam_world.to(device), K=self.K.to(device))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:

@@ -1,3 +1,5 @@
+import os
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -5,9 +7,11 @@ import pytest
 import torch
 
 from fixture_tools import fixture_path
+from freegeo.benchmark import evaluate
 from freegeo.benchmark.cloud import ReferenceCloud
 from freegeo.benchmark.evaluate import (
     SceneReference,
+    load_reference,
     mean_over_seeds,
     read_published_prediction,
     score_scene_poses,
@@ -18,6 +22,7 @@ from freegeo.benchmark.evaluate import (
 from freegeo.benchmark.frames import fusion_frames
 from freegeo.data import datasets
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.fusion.mesh import read_mesh
 
 FOLDER = fixture_path("benchmark")
 
@@ -62,6 +67,27 @@ def test_an_empty_fusion_is_flagged_and_scored_as_published(pipes):
     assert score.empty_mesh
     assert score.triangles == 0
     assert np.isfinite(score.cloud.overall)
+
+
+def test_prepared_ground_truth_is_kept_until_the_mesh_changes(pipes, tmp_path, monkeypatch):
+    scene, _ = pipes
+    mesh = tmp_path / "mesh.ply"
+    shutil.copy(scene.truth.surface, mesh)
+    scene = replace(scene, truth=replace(scene.truth, surface=mesh))
+    fresh = load_reference(scene)
+    first = load_reference(scene, cache=tmp_path / "kept")
+    reads = []
+    monkeypatch.setattr(evaluate, "read_mesh", lambda path: reads.append(path) or read_mesh(path))
+    again = load_reference(scene, cache=tmp_path / "kept")
+    assert not reads
+    for one in (first, again):
+        np.testing.assert_array_equal(one.cloud.points, fresh.cloud.points)
+        np.testing.assert_array_equal(one.box, fresh.box)
+    sample = fresh.cloud.points[::7] + 0.01
+    assert again.score(sample) == fresh.score(sample)
+    os.utime(mesh, (1, 1))
+    load_reference(scene, cache=tmp_path / "kept")
+    assert reads == [mesh]
 
 
 def test_points_outside_the_grown_box_do_not_count():

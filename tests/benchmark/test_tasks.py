@@ -7,7 +7,8 @@ import torch
 
 from bench_tools import DATASET, ROOMS, task
 from freegeo.benchmark import adapters, stored
-from freegeo.benchmark.predict import Predictor, predict_all
+from freegeo.benchmark.predict import Predictor, predict_all, true_cameras
+from freegeo.benchmark.score import evaluate_all
 from freegeo.benchmark.stored import read_stored
 from freegeo.benchmark.tasks import (
     DAMAGED,
@@ -24,6 +25,33 @@ from freegeo.benchmark.tasks import (
 )
 from freegeo.data.datasets import load_scene
 from freegeo.errors import UserError
+
+
+def test_given_cameras_change_the_prediction_and_are_scored_with(setup):
+    posed = replace(setup, given_cameras=True, out=setup.out / "posed")
+    assert predict_all(Predictor(setup), [task()]) == predict_all(Predictor(posed), [task()]) == []
+    alone, given = (read_stored(task(), one.out) for one in (setup, posed))
+    assert not torch.equal(alone.prediction.depth_z, given.prediction.depth_z)
+    assert dict(stored_tasks(posed.out))[task()]["configuration"]["given_cameras"]
+    scores = {}
+    for one in (setup, posed):
+        store = {row.metric: row.value for row in evaluate_all(one.data, one.out).rows}
+        scores[one.out] = store
+    assert scores[setup.out].keys() == scores[posed.out].keys()
+    # Both kinds in one folder cannot be compared.
+    predict_all(Predictor(replace(posed, out=setup.out)), [task(views=8)])
+    with pytest.raises(UserError, match="given_cameras"):
+        evaluate_all(setup.data, setup.out)
+
+
+def test_true_cameras_belong_to_the_models_images(setup):
+    scene = load_scene(setup.data, DATASET, ROOMS[0])
+    predictor = Predictor(setup)
+    cameras = true_cameras(scene, predictor.model)
+    width = predictor.model.preprocess(list(scene.photos)).image_hw[1]
+    torch.testing.assert_close(cameras.K[0, :, 0, 2] / width, scene.K[:, 0, 2] / 64, atol=1e-3, rtol=0)
+    torch.testing.assert_close(cameras.K[0, :, 0, 0] / width, scene.K[:, 0, 0] / 64, atol=1e-3, rtol=0)
+    torch.testing.assert_close(cameras.T_cam_world[0, 0], torch.eye(4), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("rule", FRAME_RULES)

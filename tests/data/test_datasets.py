@@ -93,6 +93,32 @@ def test_a_depth_file_of_the_wrong_size_is_an_error():
 
 
 @pytest.mark.parametrize(
+    ("dataset", "name"),
+    [
+        ("eth3d", "pipes"),
+        ("7scenes", "stairs"),
+        ("scannetpp", "09c1414f1b"),
+        ("hiroom", "20241230/828805/cam_sampled_06"),
+    ],
+)
+def test_true_depth_is_metres_and_nothing_where_the_dataset_masks(dataset, name):
+    scene = datasets.load_scene(BENCH, dataset, name)
+    index = next(i for i, path in enumerate(scene.truth.depth) if path)
+    stored = datasets.PUBLISHED[dataset].read_depth(scene.truth.depth[index], scene.photos[index].size_hw)
+    found = datasets.true_depth(scene, stored.shape)
+    assert found.shape == (len(scene), *stored.shape)
+    kept = datasets.valid_mask(scene.truth, index, stored.shape) & np.isfinite(stored)
+    np.testing.assert_array_equal(found[index].numpy(), np.where(kept, stored, 0))
+    assert 0.1 < found[index][found[index] > 0].median() < 20
+    half = datasets.true_depth(scene, (stored.shape[0] // 2, stored.shape[1] // 2))
+    np.testing.assert_array_equal(half, found[:, : stored.shape[0] // 2 * 2 : 2, : stored.shape[1] // 2 * 2 : 2])
+    without = [i for i, path in enumerate(scene.truth.depth) if path is None]
+    assert all(not found[i].any() for i in without)
+    if without:
+        assert datasets.true_depth(scene.select(without), stored.shape) is None
+
+
+@pytest.mark.parametrize(
     ("dataset", "scene"), [("eth3d", "nowhere"), ("7scenes", "fire"), ("hiroom", "a/b/c"), ("dtu", "x")]
 )
 def test_what_is_missing_is_named(dataset, scene):

@@ -81,5 +81,5 @@ def test_rate_warms_up_stays_and_cools_down():
     assert config.rate(0) == 0
     assert config.rate(500) == pytest.approx(0.5)
     assert config.rate(1000) == config.rate(80_000) == 1
-    assert config.rate(90_000) == pytest.approx(0.5)
+    assert config.rate(90_000) == pytest.approx(0.25)
     assert config.rate(100_000) == 0

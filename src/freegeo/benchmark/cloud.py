@@ -6,7 +6,7 @@ in space are neighbours in memory, which halves the time of the KD-tree searches
 
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -55,6 +55,13 @@ class ReferenceCloud:
         """Take points (n, 3) metres; `down_sample` is the voxel edge in metres, None or 0 keeps all points."""
         self.down_sample = down_sample
         self.points = _prepared(points, down_sample)
+
+    @classmethod
+    def restored(cls, points: np.ndarray, *, down_sample: float | None) -> Self:
+        """Make the cloud of `points` that another one has prepared already."""
+        cloud = cls(np.empty((0, 3)))
+        cloud.down_sample, cloud.points = down_sample, points
+        return cloud
 
     @cached_property
     def tree(self) -> Any:

@@ -4,6 +4,7 @@ One scene at a time: `score_scene_poses` and `score_scene_surface`; `SceneRefere
 which depends on no model, view count or frame seed and is worth keeping. `with_mean` gives the published score files.
 """
 
+import hashlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,16 +18,19 @@ from freegeo.benchmark.cloud import CloudScore, ReferenceCloud
 from freegeo.benchmark.frames import fusion_frames, require_prediction, require_truth
 from freegeo.benchmark.pose import score_poses
 from freegeo.data.datasets import protocol
-from freegeo.data.protocol import Protocol
+from freegeo.data.protocol import Protocol, SceneTruth
 from freegeo.data.scene import Scene
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.fusion.mesh import Mesh, empty_mesh_substitute, read_mesh, read_points, sample_surface
 from freegeo.fusion.tsdf import TsdfVolume
 from freegeo.geometry import se3
+from freegeo.storage import write_npz
 from freegeo.types import Prediction
 
 logger = logging.getLogger(__name__)
 
+GROUND_TRUTH = "ground-truth"
+"""Folder of prepared ground-truth points in a benchmark folder."""
 REFERENCE_SEED_OFFSET = 1000
 """The ground-truth mesh is sampled with the seed of the prediction plus this."""
 
@@ -60,24 +64,42 @@ class SurfaceScore:
     triangles: int
 
 
-def load_reference(scene: Scene, *, seed: int = REFERENCE_SEED_OFFSET) -> SceneReference:
+def load_reference(scene: Scene, *, seed: int = REFERENCE_SEED_OFFSET, cache: Path | None = None) -> SceneReference:
     """Read and prepare the ground truth of a scene.
 
     Args:
         scene: with ground truth.
         seed: of the points drawn from a ground-truth mesh; a stored cloud is used as it is.
+        cache: folder where the prepared points of a mesh are kept for the next run. They belong to the mesh file as it
+            is (name, size, date), to the seed and to the protocol.
 
     Raises:
         UserError: there is no ground truth, or its file is missing.
     """
     truth, _, _ = require_truth(scene)
     rules = protocol(truth.dataset)
-    if rules.truth == "mesh":
-        points = sample_surface(read_mesh(truth.surface), rules.samples, seed=seed)
-    else:
-        points = read_points(truth.surface)
+    if rules.truth == "points":
+        return _prepared(read_points(truth.surface), rules)
+    kept = None if cache is None or not truth.surface.is_file() else cache / f"{_mesh_digest(truth, rules, seed)}.npz"
+    if kept is not None and kept.is_file():
+        with np.load(kept, allow_pickle=False) as content:
+            cloud = ReferenceCloud.restored(content["points"], down_sample=rules.down_sample)
+            return SceneReference(cloud=cloud, box=(content["low"], content["high"]), protocol=rules)
+    reference = _prepared(sample_surface(read_mesh(truth.surface), rules.samples, seed=seed), rules)
+    if kept is not None:
+        write_npz(kept, {"points": reference.cloud.points, "low": reference.box[0], "high": reference.box[1]})
+    return reference
+
+
+def _prepared(points: np.ndarray, rules: Protocol) -> SceneReference:
     cloud = ReferenceCloud(points, down_sample=rules.down_sample)
     return SceneReference(cloud=cloud, box=(points.min(axis=0), points.max(axis=0)), protocol=rules)
+
+
+def _mesh_digest(truth: SceneTruth, rules: Protocol, seed: int) -> str:
+    facts = truth.surface.stat()
+    what = (str(truth.surface.resolve()), facts.st_size, facts.st_mtime_ns, seed, rules.samples, rules.down_sample)
+    return hashlib.sha256(repr(what).encode()).hexdigest()[:24]
 
 
 def score_scene_poses(scene: Scene, prediction: Prediction) -> dict[str, float]:

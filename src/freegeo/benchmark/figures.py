@@ -17,13 +17,12 @@ import torch
 
 from freegeo.benchmark.cloud import nearest_distances
 from freegeo.benchmark.depth import score_depth
-from freegeo.benchmark.evaluate import fuse_scene, load_reference
+from freegeo.benchmark.evaluate import GROUND_TRUTH, fuse_scene, load_reference
 from freegeo.benchmark.results import Row, choose, mean, read_results
-from freegeo.benchmark.scene_score import at_size
 from freegeo.benchmark.stored import read_stored
 from freegeo.benchmark.tables import NAMES, short_name
 from freegeo.benchmark.tasks import DAMAGED, Task, reason_of, stored_tasks
-from freegeo.data.datasets import load_scene
+from freegeo.data.datasets import load_scene, true_depth
 from freegeo.data.scene import Scene
 from freegeo.fusion.mesh import sample_surface
 from freegeo.storage import atomic_path
@@ -178,13 +177,15 @@ def save_figure(figure: Figure, stem: Path) -> list[Path]:
     return paths
 
 
-def depth_panel(title: str, scene: Scene, task: Task, out: Path) -> DepthPanel:
-    """A stored prediction of a scene whose depth is known, scaled by the median ratio."""
+def depth_panel(title: str, scene: Scene, task: Task, out: Path) -> DepthPanel | None:
+    """A stored prediction scaled by the median ratio; None when the depth of the scene's frames is not known."""
     stored = read_stored(task, out)
     chosen = scene.select(stored.frames)
     depth_z = stored.prediction.depth_z
-    assert chosen.depth_z is not None and chosen.K is not None and depth_z is not None
-    truth, _ = at_size(chosen.depth_z, chosen.K, (depth_z.shape[-2], depth_z.shape[-1]))
+    assert depth_z is not None
+    truth = true_depth(chosen, (depth_z.shape[-2], depth_z.shape[-1]))
+    if truth is None or not truth.any():
+        return None
     scaled = depth_z * float(score_depth(depth_z, truth).scale)
     error = torch.where(truth > 0, (scaled - truth).abs() / truth, torch.nan)
     return DepthPanel(
@@ -217,7 +218,7 @@ def _comparisons(out: Path) -> Mapping[str, tuple[Task, Task]]:
 def _draw_pair(data: Path, out: Path, name: str, one: Task, other: Task) -> list[Path]:
     titles = next(labels for kind, (_, labels) in PAIRS.items() if name.startswith(kind))
     scene = load_scene(data, one.dataset, one.scene)
-    reference = load_reference(scene)
+    reference = load_reference(scene, cache=Path(out) / GROUND_TRUTH)
     pairs = list(zip(titles, (one, other), strict=True))
     heading = f"{short_name(one.dataset)} {one.scene}, {one.views} views"
     clouds = [cloud_panel(title, scene, task, out, reference.cloud.points) for title, task in pairs]
@@ -226,8 +227,8 @@ def _draw_pair(data: Path, out: Path, name: str, one: Task, other: Task) -> list
         cloud_figure(clouds, reference.cloud.points, threshold, f"{heading}: fused surface"),
         Path(out) / FOLDER / f"cloud-{name}",
     )
-    if scene.depth_z is not None:
-        panels = [depth_panel(title, scene, task, out) for title, task in pairs]
+    panels = [panel for title, task in pairs if (panel := depth_panel(title, scene, task, out)) is not None]
+    if panels:
         files += save_figure(depth_figure(panels, f"{heading}: depth"), Path(out) / FOLDER / f"depth-{name}")
     return files
 

@@ -21,6 +21,7 @@ from freegeo.adaptation.engine import Engine
 from freegeo.adaptation.recipe import Recipe
 from freegeo.adaptation.trainer import Progress
 from freegeo.benchmark.adapters import AdapterJob, peak_memory_gb, reset_peak_memory, train, use
+from freegeo.benchmark.frames import require_truth
 from freegeo.benchmark.stored import write_stored
 from freegeo.benchmark.tasks import (
     MEASURED_FILE,
@@ -38,11 +39,14 @@ from freegeo.benchmark.variants import Variant, variant
 from freegeo.data.datasets import load_scene, scene_names
 from freegeo.data.procedural.splits import PREFIX
 from freegeo.data.scene import Scene
+from freegeo.errors import UserError
+from freegeo.geometry import se3
+from freegeo.geometry.camera import resize_K
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.catalog import load_model
 from freegeo.models.precision import Precision, autocast, choose_device, choose_precision
 from freegeo.storage import write_json
-from freegeo.types import Features, Prediction, ViewTokens
+from freegeo.types import Cameras, Features, Prediction, ViewTokens
 
 AdaptPer = Literal["dataset", "scene"]
 
@@ -65,6 +69,8 @@ class Setup:
     adapt_seed: int = 42
     epoch: int | None = None
     """Which epoch's adapter predicts; None: the last."""
+    given_cameras: bool = False
+    """Give the model the true cameras; scored with them too (`recon_posed`)."""
     scenes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Scenes of each dataset that a dataset-wise adapter is trained on."""
     overwrite: bool = False
@@ -168,11 +174,11 @@ class Predictor:
         if kind.encode_all:
             sample = choose_frames(task.rule, len(scene), SAMPLE, task.seed)
             kept = list(range(len(sample)))[::2][: task.views]
-            features = self._features(self._tokens(scene, sample)).select(kept)
+            features = self._features(self._tokens(scene, sample), self._cameras(scene, sample)).select(kept)
             frames = [sample[position] for position in kept]
         else:
             frames = choose_frames(task.rule, len(scene), task.views, task.seed)
-            features = self._features(self._tokens(scene, frames))
+            features = self._features(self._tokens(scene, frames), self._cameras(scene, frames))
         with self._arithmetic():
             found = self.model.decode(features)
         return frames, found.map(lambda tensor: tensor[0].float().cpu())
@@ -180,6 +186,8 @@ class Predictor:
     @torch.no_grad()
     def _feature_distance(self, scene: Scene, task: Task) -> tuple[list[int], dict[str, float]]:
         """Distance of the last layer's patch tokens to those of the frozen model that sees 8 views."""
+        if self.setup.given_cameras:
+            raise UserError("feature distances are those of photos alone; leave --given-cameras out.")
         sample = choose_frames(task.rule, len(scene), SAMPLE, task.seed)
         kept = list(range(len(sample)))[::2][: task.views]
         layer = self.model.spec.loss_layers[-1]
@@ -196,9 +204,15 @@ class Predictor:
         with self._arithmetic():
             return embed_in_chunks(self.model, images, device=self.engine.device)
 
-    def _features(self, tokens: ViewTokens) -> Features:
+    def _features(self, tokens: ViewTokens, cameras: Cameras | None = None) -> Features:
         with self._arithmetic():
-            return self.model.aggregate(tokens, reference="first")
+            return self.model.aggregate(tokens, reference="first", cameras=cameras)
+
+    def _cameras(self, scene: Scene, frames: Sequence[int]) -> Cameras | None:
+        """The true cameras of frames as the model takes them, when the run gives them away."""
+        if not self.setup.given_cameras:
+            return None
+        return true_cameras(scene.select(frames), self.model).to(self.engine.device)
 
     def _arithmetic(self):
         return autocast(self.engine.device, self.engine.precision)
@@ -209,6 +223,7 @@ class Predictor:
             "model": self.setup.model,
             "checkpoint": loaded.fingerprint if loaded else None,
             "precision": self.engine.precision,
+            **({"given_cameras": True} if self.setup.given_cameras else {}),
         }
 
     def _put_on(self, job: AdapterJob | None) -> None:
@@ -265,6 +280,15 @@ def problem_of(stage: Literal["predict", "evaluate"]) -> Callable[[Task, BaseExc
         return Problem(dataset=task.dataset, scene=task.scene, stage=stage, what=what, reason=reason_of(error))
 
     return explain
+
+
+def true_cameras(scene: Scene, model: ReconstructionModel) -> Cameras:
+    """True cameras (1, S) of a scene, poses normalised, K in pixels of the model's images; UserError without truth."""
+    truth, T_cam_world, K = require_truth(scene)
+    batch = model.preprocess(list(scene.photos))
+    sizes = zip(K, truth.camera_hw, scene.photos, strict=True)
+    photo_K = torch.stack([resize_K(one, camera_hw, photo.size_hw) for one, camera_hw, photo in sizes])
+    return Cameras(T_cam_world=se3.normalise_poses(T_cam_world)[None], K=batch.model_K(photo_K)[None])
 
 
 def listed_scenes(data: Path, dataset: str, limit: int | None) -> tuple[str, ...]:

@@ -1,8 +1,8 @@
 """Second stage: score stored predictions; the model is not needed any more.
 
-Metrics: `auc03` to `auc30`; of the fused surface `acc`, `comp`, `overall`, `precision`, `recall`, `fscore`; for
-generated rooms also `abs_rel`, `delta1`, `f1_rel5`; `mse` and `cosine` of features; `seconds` and `peak_gb` of the
-pass, and of an adapter `adapt_seconds`, `adapt_steps`, `adapt_peak_gb`, `trainable`.
+Metrics: `auc03` to `auc30`; of the fused surface `acc`, `comp`, `overall`, `precision`, `recall`, `fscore`; where the
+depth of frames is known `abs_rel`, `delta1`, for generated rooms also `f1_rel5`; `mse` and `cosine` of features;
+`seconds` and `peak_gb` of the pass, and of an adapter `adapt_seconds`, `adapt_steps`, `adapt_peak_gb`, `trainable`.
 """
 
 from __future__ import annotations
@@ -17,10 +17,16 @@ import torch
 
 from freegeo.benchmark.adapters import FINISHED, FOLDER
 from freegeo.benchmark.depth import score_depth
-from freegeo.benchmark.evaluate import SceneReference, load_reference, score_scene_poses, score_scene_surface
+from freegeo.benchmark.evaluate import (
+    GROUND_TRUTH,
+    SceneReference,
+    load_reference,
+    score_scene_poses,
+    score_scene_surface,
+)
 from freegeo.benchmark.predict import problem_of
 from freegeo.benchmark.results import Row, rows_of, write_results
-from freegeo.benchmark.scene_score import at_size, evaluate
+from freegeo.benchmark.scene_score import evaluate
 from freegeo.benchmark.stored import Stored, read_stored
 from freegeo.benchmark.tasks import (
     MEASURED_FILE,
@@ -34,13 +40,13 @@ from freegeo.benchmark.tasks import (
     stored_tasks,
 )
 from freegeo.benchmark.variants import variant
-from freegeo.data.datasets import load_scene
+from freegeo.data.datasets import load_scene, true_depth
 from freegeo.data.scene import Scene
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.storage import read_json, write_json
 
 EMPTY_SURFACE = "the fusion gave no surface: precision, recall and F1 are 0, distances do not exist"
-_SAME_IN_ALL = ("model", "checkpoint", "precision")
+_SAME_IN_ALL = ("model", "checkpoint", "precision", "given_cameras")
 _SAME_IN_VARIANT = ("per", "epoch", "recipe", "seed", "scenes")
 
 
@@ -75,9 +81,12 @@ def evaluate_all(
     asked = list(stored) if wanted is None else [task for task in wanted if task in stored]
     problems: list[Problem] = []
     for (dataset, name), tasks in by_scene(asked).items():
-        ground = _Ground(data, dataset, name)
+        ground = _Ground(data, dataset, name, out / GROUND_TRUTH)
         problems += run_each(
-            tasks, lambda task, ground=ground: _scored(task, ground, out, device), problem_of("evaluate"), on_task
+            tasks,
+            lambda task, ground=ground: _scored(task, stored[task], ground, out, device),
+            problem_of("evaluate"),
+            on_task,
         )
     missing = [] if wanted is None else [task for task in dict.fromkeys(wanted) if task not in stored]
     problems += [problem_of("evaluate")(task, FreeGeoError("no stored prediction")) for task in missing]
@@ -91,7 +100,7 @@ def require_same_settings(stored: Mapping[Task, Mapping[str, Any]]) -> None:
     of_variant: dict[tuple[str, ...], tuple[Task, Mapping[str, Any]]] = {}
     for task, record in stored.items():
         configuration = record["configuration"]
-        common = {name: configuration[name] for name in _SAME_IN_ALL}
+        common = {name: configuration.get(name) for name in _SAME_IN_ALL}
         first = first or (task, common)
         _require_equal(first, (task, common))
         adaptation = configuration["adaptation"]
@@ -115,8 +124,8 @@ def _require_equal(one: tuple[Task, Mapping[str, Any]], other: tuple[Task, Mappi
 class _Ground:
     """A scene with its ground truth, read when it is needed and once."""
 
-    def __init__(self, data: Path, dataset: str, name: str):
-        self.data, self.dataset, self.name = data, dataset, name
+    def __init__(self, data: Path, dataset: str, name: str, cache: Path):
+        self.data, self.dataset, self.name, self.cache = data, dataset, name, cache
         self._scene: Scene | None = None
         self._reference: SceneReference | None = None
 
@@ -127,11 +136,13 @@ class _Ground:
 
     def reference(self) -> SceneReference:
         """Its ground-truth cloud with the search tree."""
-        self._reference = self._reference or load_reference(self.scene())
+        self._reference = self._reference or load_reference(self.scene(), cache=self.cache)
         return self._reference
 
 
-def _scored(task: Task, ground: _Ground, out: Path, device: str | torch.device) -> list[Problem]:
+def _scored(
+    task: Task, record: Mapping[str, Any], ground: _Ground, out: Path, device: str | torch.device
+) -> list[Problem]:
     """Score one task unless that has been done without a failure; returns the parts that could not be scored."""
     path = task.folder(out) / SCORES_FILE
     if path.is_file() and not read_json(path)["failed"]:
@@ -144,13 +155,14 @@ def _scored(task: Task, ground: _Ground, out: Path, device: str | torch.device) 
     scene = ground.scene()
     if max(stored.frames) >= len(scene):
         raise FreeGeoError(f"frame {max(stored.frames)} was predicted, but the data folder holds {len(scene)} frames")
-    metrics, failed = _metrics(scene.select(stored.frames), stored, ground, device)
+    posed = bool(record["configuration"].get("given_cameras"))
+    metrics, failed = _metrics(scene.select(stored.frames), stored, ground, device, posed=posed)
     write_json(path, {"metrics": metrics, "failed": failed})
     return _problems(task, failed)
 
 
 def _metrics(
-    chosen: Scene, stored: Stored, ground: _Ground, device: str | torch.device
+    chosen: Scene, stored: Stored, ground: _Ground, device: str | torch.device, *, posed: bool
 ) -> tuple[dict[str, float], dict[str, str]]:
     """Metrics that exist, and why the others do not."""
     metrics: dict[str, float] = {}
@@ -165,7 +177,7 @@ def _metrics(
         return ()
 
     def surface() -> dict[str, float]:
-        score = score_scene_surface(chosen, stored.prediction, reference=ground.reference(), device=device)
+        score = score_scene_surface(chosen, stored.prediction, posed=posed, reference=ground.reference(), device=device)
         if score.empty_mesh:
             failed["surface"] = EMPTY_SURFACE
             return {"precision": 0.0, "recall": 0.0, "fscore": 0.0}
@@ -178,7 +190,8 @@ def _metrics(
 
     parts = {"poses": cameras, "surface": surface}
     if chosen.depth_z is not None:
-        parts["depth"] = lambda: _room_metrics(chosen, stored)
+        parts["points"] = lambda: {"f1_rel5": evaluate(stored.prediction, chosen)["f1_rel5"]}
+    parts["depth"] = lambda: _depth_metrics(chosen, stored)
     for name, work in parts.items():
         for problem in run_each(
             [name],
@@ -189,14 +202,14 @@ def _metrics(
     return metrics, failed
 
 
-def _room_metrics(chosen: Scene, stored: Stored) -> dict[str, float]:
-    prediction = stored.prediction
-    assert chosen.depth_z is not None and chosen.K is not None and prediction.depth_z is not None
-    scores = evaluate(prediction, chosen)
-    size = (prediction.depth_z.shape[-2], prediction.depth_z.shape[-1])
-    depth_true, _ = at_size(chosen.depth_z, chosen.K, size)
-    delta1 = score_depth(prediction.depth_z, depth_true).delta1
-    return {"abs_rel": scores["abs_rel"], "delta1": float(delta1), "f1_rel5": scores["f1_rel5"]}
+def _depth_metrics(chosen: Scene, stored: Stored) -> dict[str, float]:
+    depth_z = stored.prediction.depth_z
+    assert depth_z is not None
+    depth_true = true_depth(chosen, (depth_z.shape[-2], depth_z.shape[-1]))
+    if depth_true is None:
+        return {}
+    score = score_depth(depth_z, depth_true)
+    return {"abs_rel": float(score.abs_rel), "delta1": float(score.delta1)}
 
 
 def _problems(task: Task, failed: Mapping[str, str]) -> list[Problem]:

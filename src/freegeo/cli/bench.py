@@ -79,6 +79,8 @@ class BenchModel:
     """Seed of the adaptation."""
     epoch: int | None = None
     """Epoch whose adapter is used, counted from 0; default: the last."""
+    given_cameras: bool = False
+    """Give the model the true cameras and fuse its depth with them (recon_posed)."""
 
 
 DEFAULT_BENCH, DEFAULT_MODEL = BenchOptions(), BenchModel()
@@ -240,7 +242,8 @@ def _prepare(
             data=bench.data, out=bench.output, model=model.model, checkpoint=model.checkpoint, device=model.device,
             precision=model.precision, recipe=model.recipe,
             changes={"steps": steps, "epochs": model.epochs, "lr": model.lr}, adapt_per=model.adapt_per,
-            adapt_seed=model.adapt_seed, epoch=model.epoch, scenes=scenes, overwrite=overwrite,
+            adapt_seed=model.adapt_seed, epoch=model.epoch, given_cameras=model.given_cameras, scenes=scenes,
+            overwrite=overwrite,
         )
     )  # fmt: skip
     use_few_threads(predictor.model)

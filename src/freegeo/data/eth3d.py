@@ -112,9 +112,9 @@ def valid_mask(truth: SceneTruth, index: int, size_hw: tuple[int, int]) -> np.nd
     return keep
 
 
-def read_depth(path: Path, size_hw: tuple[int, int]) -> np.ndarray:
+def read_depth(path: Path, photo_hw: tuple[int, int]) -> np.ndarray:
     """Ground-truth depth (H, W) float32 metres; 0 or inf where there is none."""
-    height, width = size_hw
+    height, width = photo_hw
     if path.stat().st_size != 4 * height * width:
         raise FreeGeoError(f"{path}: {path.stat().st_size} bytes do not fit an image of {width} x {height} pixels.")
-    return np.fromfile(path, dtype="<f4").reshape(size_hw)
+    return np.fromfile(path, dtype="<f4").reshape(photo_hw)

@@ -79,12 +79,12 @@ def valid_mask(truth: SceneTruth, index: int, size_hw: tuple[int, int]) -> np.nd
     depth_path, aliasing_path = truth.depth[index], truth.mask[index]
     if depth_path is None:
         return None
-    keep = read_depth(depth_path) > 0
+    keep = read_depth(depth_path, size_hw) > 0
     return keep if aliasing_path is None else keep & ~(read_gray(aliasing_path) > 0)
 
 
-def read_depth(path: Path) -> np.ndarray:
-    """Ground-truth depth (H, W) float32 metres, 0 where there is none."""
+def read_depth(path: Path, photo_hw: tuple[int, int]) -> np.ndarray:
+    """Ground-truth depth (H, W) float32 metres, 0 where there is none. `photo_hw` is not used."""
     return (read_gray(path) * _METRES_PER_STEP).astype(np.float32)
 
 

@@ -137,10 +137,10 @@ def valid_mask(truth: SceneTruth, index: int, size_hw: tuple[int, int]) -> np.nd
     if path is None:
         return None
     height, width = size_hw
-    depth = cv2.resize(read_depth(path), (width, height), interpolation=cv2.INTER_LINEAR)
+    depth = cv2.resize(read_depth(path, size_hw), (width, height), interpolation=cv2.INTER_LINEAR)
     return (depth > 0) & np.isfinite(depth)
 
 
-def read_depth(path: Path) -> np.ndarray:
-    """Rendered ground-truth depth (H, W) float32 metres, 0 where there is none."""
+def read_depth(path: Path, photo_hw: tuple[int, int]) -> np.ndarray:
+    """Rendered ground-truth depth (H, W) float32 metres, 0 where there is none. `photo_hw` is not used."""
     return read_gray(path).astype(np.float32) / 1000

@@ -73,11 +73,11 @@ def load_scene(root: Path, name: str) -> Scene:
 def valid_mask(truth: SceneTruth, index: int, size_hw: tuple[int, int]) -> np.ndarray | None:
     """Pixels of one frame with a ground-truth depth, (H, W) bool; None without a depth file. `size_hw` is not used."""
     path = truth.depth[index]
-    return None if path is None else read_depth(path) > 0
+    return None if path is None else read_depth(path, size_hw) > 0
 
 
-def read_depth(path: Path) -> np.ndarray:
-    """Ground-truth depth (H, W) float32 metres, 0 where there is none."""
+def read_depth(path: Path, photo_hw: tuple[int, int]) -> np.ndarray:
+    """Ground-truth depth (H, W) float32 metres, 0 where there is none. `photo_hw` is not used."""
     millimetres = read_gray(path)
     return np.where(millimetres == _INVALID_MM, 0, millimetres).astype(np.float32) / 1000
 

@@ -10,7 +10,7 @@ class LossWeights:
     """Weights of the training objective (embedded-model spec, section 4)."""
 
     depth: float = 2.0
-    cell_depth: float = 2.0
+    cell_depth: float = 4.0
     gradient: float = 0.5
     rotation: float = 3.0
     translation: float = 1.0
@@ -39,7 +39,7 @@ class Stage:
 class TrainConfig:
     """Train the embedded model on generated rooms."""
 
-    views: int = 400_000
+    views: int = 450_000
     """Views the model learns from, counted with repetition; the last `cooldown` of them lower the learning rate."""
     seed: int = 0
     side: int = 64
@@ -56,14 +56,14 @@ class TrainConfig:
     """AdamW, for the dense head and the last linear layers. Their inputs have a large mean, so that a step moves all
     outputs of a layer together: at 2e-3 rectifiers died within a few hundred steps, and the answers were constant."""
     warmup_views: int = 6_000
-    cooldown: float = 0.25
+    cooldown: float = 0.69
     ema: float = 0.99
     clip: float = 1.0
     pairs_until: int = 25_000
     """Views before windows reach beyond 2 or 3 neighbouring frames."""
     short_until: int = 60_000
     """Views before windows reach 8 views and stride 3."""
-    small_until: int = 240_000
+    small_until: int = 270_000
     """Views before the images reach their full size; at three quarters of it a view costs 40 % less."""
     depth_views: int = 8
     """Views that the dense head learns from in one step, at most one of each sample."""
@@ -83,10 +83,10 @@ class TrainConfig:
         return Stage(views=(2, 4, 4, 6, 8, 8), max_stride=3, side=side)
 
     def rate(self, seen: int) -> float:
-        """Return the factor on both learning rates: warm-up, plateau, linear cool-down to zero."""
+        """Return the factor on all learning rates: warm-up, plateau, quadratic cool-down to zero."""
         warm = min(1.0, seen / self.warmup_views)
         start = self.cooldown_start
-        return warm if seen < start else max(0.0, (self.views - seen) / (self.views - start))
+        return warm if seen < start else max(0.0, (self.views - seen) / (self.views - start)) ** 2
 
     @property
     def cooldown_start(self) -> float:
