@@ -128,5 +128,6 @@ def test_mistakes_end_with_a_sentence_and_code_2(freegeo, tmp_path, monkeypatch,
 def test_the_estimate_alone_computes_nothing(freegeo, options, tmp_path):
     code, out, _ = freegeo("predict", "overhead", *options, "--estimate-only")
     assert code == 0
-    assert "minutes" in out
+    assert "minutes for the predictions" in out
+    assert "surfaces of" in out
     assert not (tmp_path / "out" / "predictions").exists()

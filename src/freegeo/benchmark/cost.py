@@ -6,15 +6,26 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+
+import torch
 
 from freegeo.adaptation.images import SceneImages
 from freegeo.adaptation.recipe import Recipe
 from freegeo.adaptation.trainer import adapt
+from freegeo.benchmark.cloud import ReferenceCloud
 from freegeo.benchmark.predict import Predictor
-from freegeo.benchmark.tasks import SAMPLE, Task
+from freegeo.benchmark.tasks import DAMAGED, SAMPLE, Task
 from freegeo.benchmark.variants import variant
+from freegeo.data.datasets import load_scene, protocol
+from freegeo.data.protocol import Protocol
+from freegeo.fusion.mesh import sample_surface
+from freegeo.fusion.tsdf import TsdfVolume
+from freegeo.geometry.camera import K_from_fov
 
 MEASURED_STEPS = 3
+MEASURED_FRAMES = 2
+WALL_DEPTH_M = (1.0, 4.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +72,69 @@ def estimate(predictor: Predictor, tasks: Sequence[Task]) -> Cost:
     return Cost(
         passes=passes, seconds_of_pass=seconds, adapters=len(jobs), steps=steps, seconds_of_step=seconds_of_step
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoringCost:
+    """What the second stage will take, from one small fusion per dataset."""
+
+    dataset: str
+    frames: int
+    """Depth maps to be fused."""
+    surfaces: int
+    seconds_of_frame: float
+    seconds_of_surface: float
+    """Meshing, sampling, averaging and both nearest-neighbour searches."""
+
+    @property
+    def seconds(self) -> float:
+        """Predicted duration."""
+        return self.frames * self.seconds_of_frame + self.surfaces * self.seconds_of_surface
+
+    def line(self) -> str:
+        """Say it to a person."""
+        return (
+            f"{self.dataset}: {self.surfaces} surfaces of {self.frames} frames to score, {self.seconds_of_frame:.2f} s "
+            f"a frame and {self.seconds_of_surface:.1f} s a surface: about {self.seconds / 60:.1f} minutes"
+        )
+
+
+def estimate_scoring(data: Path, tasks: Sequence[Task], *, device: torch.device | str = "cpu") -> list[ScoringCost]:
+    """Measure fusion and scoring of a slanted wall at each dataset's sizes; a room has more surface than that.
+
+    A dataset whose first scene cannot be read is left out: the run itself will say why.
+    """
+    costs = []
+    for dataset in dict.fromkeys(task.dataset for task in tasks):
+        own = [task for task in tasks if task.dataset == dataset and variant(task.variant).measures == "prediction"]
+        if not own:
+            continue
+        try:
+            scene = load_scene(data, dataset, own[0].scene)
+        except DAMAGED:
+            continue
+        rules = protocol(dataset)
+        frame, surface = _seconds_of_fusion(rules, rules.fusion_hw or scene.photos[0].size_hw, device)
+        costs.append(
+            ScoringCost(
+                dataset=dataset, frames=sum(task.views for task in own), surfaces=len(own), seconds_of_frame=frame,
+                seconds_of_surface=surface,
+            )
+        )  # fmt: skip
+    return costs
+
+
+def _seconds_of_fusion(rules: Protocol, size_hw: tuple[int, int], device: torch.device | str) -> tuple[float, float]:
+    depth_z = torch.linspace(*WALL_DEPTH_M, size_hw[1]).expand(size_hw)
+    K = K_from_fov(torch.tensor(0.8), torch.tensor(1.0), size_hw)
+    volume = TsdfVolume(voxel=rules.voxel, truncation=rules.truncation, device=device)
+    started = time.perf_counter()
+    for _ in range(MEASURED_FRAMES):
+        volume.integrate(depth_z, K, torch.eye(4), depth_limit=rules.depth_limit)
+    fused = time.perf_counter()
+    points = sample_surface(volume.extract_mesh(), rules.samples, seed=0)
+    ReferenceCloud(points, down_sample=rules.down_sample).score(points, threshold=rules.threshold)
+    return (fused - started) / MEASURED_FRAMES, time.perf_counter() - fused
 
 
 def _seconds_of_pass(predictor: Predictor, views: int) -> float:

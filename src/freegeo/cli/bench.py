@@ -253,7 +253,7 @@ def _prepare(
 def _predict(
     predictor: Predictor, tasks: list[Task], bench: BenchOptions, *, estimate_only: bool = False, cluster: bool = False
 ) -> list[Problem]:
-    from freegeo.benchmark.cost import estimate
+    from freegeo.benchmark.cost import estimate, estimate_scoring
     from freegeo.benchmark.predict import predict_all
     from freegeo.storage import locked
 
@@ -263,6 +263,8 @@ def _predict(
         return []
     for line in estimate(predictor, waiting).lines():
         console.say(f"  {line}")
+    for cost in estimate_scoring(bench.data, waiting, device=predictor.engine.device):
+        console.say(f"  {cost.line()}")
     if estimate_only:
         return []
     with locked(bench.output), console.progress_bar("predicting", len(waiting)) as update:
