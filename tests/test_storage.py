@@ -350,3 +350,12 @@ with run_folder(Path({str(tmp_path)!r}), {{"a": 1}}) as run:
     with run_folder(tmp_path, {"a": 1}) as run:
         assert not run.finished
         assert visible(tmp_path) == {"deep/a.json"}
+
+
+def test_a_full_disk_names_the_file_that_was_asked_for(tmp_path):
+    path = tmp_path / "result.json"
+    with pytest.raises(OSError, match="No space left") as caught, atomic_path(path) as part:
+        part.write_text("half")
+        raise OSError(28, "No space left on device")
+    assert caught.value.filename == str(path)
+    assert list(tmp_path.iterdir()) == []

@@ -34,7 +34,7 @@ def atomic_path(path: Path) -> Generator[Path]:
     """Give a temporary path beside `path` to write to; it takes the final name only when the block succeeds.
 
     The temporary name keeps the suffix, since writers choose the format by it. UserError when the folder cannot be
-    written to.
+    written to; an OSError while writing, such as a full disk, names the final path.
     """
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
     try:
@@ -45,6 +45,10 @@ def atomic_path(path: Path) -> Generator[Path]:
         temporary.replace(path)
     except PermissionError:
         raise UserError(f"{path.parent}: the folder cannot be written to. Choose another output folder.") from None
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 

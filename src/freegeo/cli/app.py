@@ -11,6 +11,7 @@ with the long names of the options without their dashes; a switch is true or fal
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import tomllib
@@ -100,7 +101,8 @@ def run_command(arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         return console.fail("interrupted; the same command continues an unfinished run.", INTERRUPTED)
     except OSError as error:
-        return console.fail(f"{error.filename or 'input or output'}: {error.strerror or error}.", FAILURE)
+        hint = " Make room and run the same command again; it continues." if error.errno == errno.ENOSPC else ""
+        return console.fail(f"{error.filename or 'input or output'}: {error.strerror or error}.{hint}", FAILURE)
     return 0
 
 

@@ -148,6 +148,7 @@ def predict(
     """
     predictor, tasks = _prepare(experiments, bench, model, overwrite)
     problems = _predict(predictor, tasks, bench, estimate_only=estimate_only, cluster=cluster)
+    _say(problems)
     _require_none(problems, bench.output)
 
 
@@ -167,6 +168,7 @@ def evaluate(
         Draw the figures too.
     """
     problems = _evaluate(bench, device, wanted=None)
+    _say(problems)
     _tables(experiments or ("all",), bench)
     if figures:
         _figures(bench)
@@ -203,9 +205,11 @@ def run(
     stored = {task for task, _ in stored_tasks(bench.output)}
     wanted = [task for task in tasks if task in stored]
     if not wanted:
+        _say(problems)
         _require_none(problems, bench.output)
         return
     problems += _evaluate(bench, model.device, wanted=wanted)
+    _say(problems)
     _tables(experiments, bench)
     if figures:
         _figures(bench)
@@ -343,8 +347,16 @@ def _figures(bench: BenchOptions) -> None:
         console.say(str(path))
 
 
+def _say(problems: Sequence[Problem]) -> None:
+    """List what failed, before anything else can."""
+    for problem in problems[:SHOWN_PROBLEMS]:
+        console.note(str(problem))
+    if len(problems) > SHOWN_PROBLEMS:
+        console.note(f"and {len(problems) - SHOWN_PROBLEMS} more")
+
+
 def _require_none(problems: Sequence[Problem], out: Path) -> None:
-    """List what failed and end with exit code 1 when anything did."""
+    """Store what failed and end with exit code 1 when anything did."""
     from dataclasses import asdict
 
     from freegeo.storage import write_json
@@ -352,10 +364,6 @@ def _require_none(problems: Sequence[Problem], out: Path) -> None:
     if not problems:
         (out / PROBLEMS_FILE).unlink(missing_ok=True)
         return
-    for problem in problems[:SHOWN_PROBLEMS]:
-        console.note(str(problem))
-    if len(problems) > SHOWN_PROBLEMS:
-        console.note(f"and {len(problems) - SHOWN_PROBLEMS} more")
     write_json(out / PROBLEMS_FILE, [asdict(problem) for problem in problems])
     scenes = {(problem.dataset, problem.scene) for problem in problems}
     raise FreeGeoError(
