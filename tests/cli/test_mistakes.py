@@ -246,6 +246,9 @@ def test_full_disk_is_a_failure_and_the_run_can_go_on(freegeo, photo_folder, tin
         patch.setattr(np, "savez_compressed", full)
         outcome = freegeo("reconstruct", photo_folder, "-o", tmp_path / "out", *tiny)
     assert outcome.code == 1
-    assert outcome.sentence() == "freegeo: prediction.npz: No space left on device."
+    assert outcome.sentence() == (
+        f"freegeo: {tmp_path / 'out' / 'prediction.npz'}: No space left on device. "
+        "Make room and run the same command again; it continues."
+    )
     assert not (tmp_path / "out" / "prediction.npz").exists()
     assert freegeo("reconstruct", photo_folder, "-o", tmp_path / "out", *tiny).code == 0

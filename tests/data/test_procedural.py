@@ -126,6 +126,14 @@ def test_both_families_at_their_shares():
     assert 0.54 < share < 0.66
 
 
+def test_scored_rooms_have_one_lens_and_the_lens_domain_many():
+    for name in ("test-id", "val-id", "big", "val-light"):
+        fov_deg = torch.rad2deg(sample_rooms(DOMAINS[name].seeds(20), domain=name, frames=1).fov_rad)
+        torch.testing.assert_close(fov_deg, torch.full_like(fov_deg, 65.0))
+    fov_deg = torch.rad2deg(sample_rooms(DOMAINS["lens"].seeds(20), domain="lens", frames=1).fov_rad)
+    assert 58.0 <= fov_deg.min() < 63.0 < 67.0 < fov_deg.max() <= 72.0
+
+
 def test_field_of_view_is_drawn_per_room_and_within_its_range():
     fov_deg = torch.rad2deg(rooms().fov_rad)
     assert fov_deg.min() >= 58.0 and fov_deg.max() <= 72.0 and fov_deg.std() > 2.0
@@ -195,7 +203,7 @@ def test_intrinsics_follow_a_resize_exactly():
 def test_seeds_of_the_domains_are_disjoint():
     spans = sorted((d.first_seed, d.first_seed + d.seed_count, d.name) for d in DOMAINS.values())
     assert all(before[1] <= after[0] for before, after in pairwise(spans))
-    assert set(DOMAINS) == {"train", "test-id", *SHIFTED, "val-id", *(f"val-{name}" for name in SHIFTED)}
+    assert set(DOMAINS) == {"train", "test-id", *SHIFTED, "lens", "val-id", *(f"val-{name}" for name in SHIFTED)}
     for name, domain in DOMAINS.items():
         assert domain.name == name
         assert domain.room_count <= domain.seed_count

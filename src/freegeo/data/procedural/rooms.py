@@ -28,7 +28,6 @@ MATERIALS = 6 + PRIMITIVES - 1
 CLEARANCE_M = 0.3
 """A primitive that comes closer to a camera is left out."""
 PERIOD_M = (2.5, 6.0)
-FIELD_OF_VIEW_DEG = (58.0, 72.0)
 
 _OBJECT_NUMBERS = 8
 _MATERIAL_NUMBERS = 17
@@ -120,7 +119,7 @@ def sample_rooms(
     camera = -(T_cam_room[..., :3, :3].mT @ T_cam_room[..., :3, 3:])[..., 0]
     near = (_distance(camera, center, yaw, size) < CLEARANCE_M).any(dim=1)
     near[:, 0] = False
-    low, high = FIELD_OF_VIEW_DEG
+    low, high = domain.field_of_view_deg
     batch = RoomBatch(
         domain=domain,
         seeds=seeds,
