@@ -118,7 +118,7 @@ def test_cameras_stand_inside_off_the_walls_and_clear_of_everything(domain):
     present = batch.size[:, 1:, 0] > 0
     distance = _distance(centres, batch.center, batch.yaw, batch.size)[..., 1:]
     assert distance.amin(1)[present].min() >= CLEARANCE_M
-    assert 0.7 < present.float().mean() < 1.0
+    assert 0.5 < present.float().mean() < 1.0
 
 
 def test_both_families_at_their_shares():

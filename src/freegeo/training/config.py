@@ -45,7 +45,7 @@ class TrainConfig:
     side: int = 64
     """Longest image side in pixels."""
     views_per_step: int = 48
-    rooms: int = 6_144
+    rooms: int = 3_840
     """Rooms in the pool; they are rendered a shard at a time while training goes on."""
     frames: int = 10
     matrix_lr: float = 4e-3

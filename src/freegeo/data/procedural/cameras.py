@@ -16,7 +16,10 @@ ARC_SHARE = 0.6
 STEP_DEG = (10.6, 21.4)
 """Range of a trajectory's turn from one view to the next; its own steps vary by 5 % around it."""
 WALL_MARGIN_M = 0.4
-WALK_STEP_M = (0.36, 0.75)
+WALK_STEP_M = (0.36, 0.6)
+WALK_RADIUS = (0.2, 0.45)
+"""Half axes of a walk over those of the room. Farther out the walls are so near that a fifth of the rooms had next to
+no overlap between every second view."""
 
 TRAJECTORY_NUMBERS = 16
 """Uniform numbers that describe a trajectory as a whole."""
@@ -88,7 +91,7 @@ def _walk(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """A walk along an ellipse while the gaze, outwards at first, pans at its own rate."""
     frames = turns.shape[1]
-    axes = inner * _between(trajectory[:, 3:4], 0.4, 0.65)
+    axes = inner * _between(trajectory[:, 3:4], *WALK_RADIUS)
     pace = signed_step.abs() * axes.mean(1) * _between(trajectory[:, 4], 0.85, 1.3)
     pace = pace.clamp(*WALK_STEP_M) * signed_step.sign()
     angle = 2.0 * math.pi * trajectory[:, 5]

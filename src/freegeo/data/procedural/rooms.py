@@ -25,8 +25,8 @@ PRIMITIVES = 1 + BOXES + SPHERES + CYLINDERS
 FIRST_SPHERE, FIRST_CYLINDER = 1 + BOXES, 1 + BOXES + SPHERES
 MATERIALS = 6 + PRIMITIVES - 1
 """Materials 0-5 are the room's faces (-x, +x, -y, +y, floor, ceiling), 5 + k is the material of primitive k."""
-CLEARANCE_M = 0.3
-"""A primitive that comes closer to a camera is left out."""
+CLEARANCE_M = 0.8
+"""A primitive that comes closer to a camera is left out: at 0.3 m many views showed one surface and nothing else."""
 PERIOD_M = (2.5, 6.0)
 
 _OBJECT_NUMBERS = 8
