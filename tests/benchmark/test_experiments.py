@@ -10,7 +10,7 @@ from tiny_models import tiny_da3
 
 NAMES_OF_THE_ISSUE = {
     "long-sequence", "main", "cross-views", "loss-ablation", "features", "anchors", "lora-rank", "pose-detail",
-    "recon-detail", "overhead",
+    "recon-detail", "overhead", "gain",
 }  # fmt: skip
 
 
@@ -53,6 +53,12 @@ def test_published_numbers_are_found(name, label, dataset, metric, family, print
     assert published_value(entry, line, dataset, metric, family) == pytest.approx(printed)
     assert published_value(entry, line, "procedural-light", metric, family) is None
     assert published_value(entry, line, dataset, metric, None) is None
+
+
+def test_the_gain_compares_the_same_frames():
+    entry = EXPERIMENTS["gain"]
+    assert {task.rule for task in entry.tasks({"eth3d": ["a"]}, rule="da3")} == {"vggt"}
+    assert {task.rule for task in entry.tasks({"procedural-big": ["1"]}, rule="neighbours")} == {"neighbours"}
 
 
 def test_every_published_line_with_a_place_has_numbers():

@@ -1,5 +1,6 @@
 import csv
 import io
+from dataclasses import replace
 
 import pytest
 
@@ -99,6 +100,29 @@ def test_the_two_means_differ_and_are_named():
 )
 def test_verdicts_know_which_way_is_better(metric, interval, scenes, said):
     assert verdict(metric, interval, scenes) == said
+
+
+def test_the_gain_table_says_what_of_the_gap_was_reached():
+    found = [
+        row
+        for variant, auc, chamfer in (("frozen", 0.3, 0.5), ("8to4", 0.4, 0.5), ("adapted", 0.32, 0.4))
+        for row in rows(variant, 4, {"auc30": auc, "overall": chamfer}, rule="vggt")
+    ]
+    found += rows("frozen", 8, {"auc30": 0.5}, rule="vggt") + rows("adapted", 8, {"auc30": 0.48}, rule="vggt")
+    lost = found.index(next(row for row in found if row.variant == "adapted" and row.scene == "scene 3"))
+    found[lost] = replace(found[lost], value=found[lost].value - 0.14)
+    (table,) = experiment_tables(EXPERIMENTS["gain"], found, rule="da3")
+    cells = {row[:2]: dict(zip(table.header[2:6], row[2:6], strict=True)) | {"rest": row[6:]} for row in table.rows}
+    assert set(cells) == {("eth3d: 4 views", "AUC@30"), ("eth3d: 4 views", "CD"), ("eth3d: 8 views", "AUC@30")}
+    four = cells["eth3d: 4 views", "AUC@30"]
+    # 0.02 in every scene and seed, but for one seed of scene 3, which loses 0.12
+    assert (four["frozen"], four["adapted"], four["gain"]) == ("0.325", "0.333", "+0.008")
+    verdict_cell, gap, _, share, worst, scenes = four["rest"]
+    assert (verdict_cell, gap, share, worst, scenes) == ("open", "+0.100", "8%", "scene 3 -0.050", "6")
+    # A smaller distance is better; without a gap there is no share.
+    assert cells["eth3d: 4 views", "CD"]["rest"][0] == "better"
+    assert cells["eth3d: 4 views", "CD"]["rest"][3] == ""
+    assert cells["eth3d: 8 views", "AUC@30"]["rest"][:4] == ("worse", "", "", "")
 
 
 def test_all_formats_carry_every_cell(main_tables):

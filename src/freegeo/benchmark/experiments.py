@@ -14,7 +14,7 @@ from freegeo.errors import UserError
 
 ROOMS = tuple(f"{PREFIX}{name}" for name in ("test-id", "light", "lowtex", "tex", "big"))
 """The splits of the generated rooms that are reported."""
-Layout = Literal["means", "changes", "costs"]
+Layout = Literal["means", "changes", "costs", "gain"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,13 +43,22 @@ class Experiment:
     paper: str | None = None
     """Key of the published table."""
     layout: Layout = "means"
-    """`means` over scenes and seeds; `changes`: relative ones in percent of the second line of each pair; `costs`."""
+    """`means` over scenes and seeds; `changes`: relative ones in percent of the second line of each pair; `costs`;
+    `gain`: frozen, adapted and what the held-out views are worth, in one row per metric."""
     rule: FrameRule | None = None
     """Frame rule that belongs to the table; None: the run's."""
     seeds: tuple[int, ...] = PAPER_SEEDS
+    every_second: bool = False
+    """Whether fewer than 8 views have to be every second one of the 8; the rule `da3` draws others, `vggt` replaces it."""
     published_dataset: str | None = None
     """The only published dataset the paper reports it on; None: all four."""
     rooms: tuple[str, ...] = ROOMS
+
+    def frame_rule(self, rule: FrameRule) -> FrameRule:
+        """The rule of the table in a run of this rule."""
+        if self.rule is not None:
+            return self.rule
+        return "vggt" if self.every_second and rule == "da3" else rule
 
     def lines_for(self, dataset: str) -> list[Line]:
         """The lines that can be computed on a dataset: generated rooms have 16 frames."""
@@ -66,7 +75,7 @@ class Experiment:
         """All tasks of the table on these scenes (dataset -> names); `seeds` and `views` narrow or replace its own."""
         return [
             Task(
-                dataset=dataset, scene=scene, rule=self.rule or rule, views=line.views, seed=seed,
+                dataset=dataset, scene=scene, rule=self.frame_rule(rule), views=line.views, seed=seed,
                 variant=line.variant,
             )
             for dataset, names in scenes.items()
@@ -227,6 +236,19 @@ EXPERIMENTS: dict[str, Experiment] = {
             lines=_before_and_after(PAPER_BUDGETS),
             metrics=("fscore", "overall"),
             room_metrics=("fscore", "overall", "f1_rel5", "abs_rel"),
+        ),
+        Experiment(
+            name="gain",
+            title="What adaptation gains, and how much of what the held-out views are worth",
+            lines=(
+                *_before_and_after((4,)),
+                Line(label="8->4", variant="8to4", views=4, compare_with="4 views, frozen"),
+                *_before_and_after((8, 16)),
+            ),
+            metrics=_ALL_FOUR,
+            room_metrics=("auc05", "auc15", "auc30", "fscore", "f1_rel5", "abs_rel"),
+            layout="gain",
+            every_second=True,
         ),
         Experiment(
             name="overhead",

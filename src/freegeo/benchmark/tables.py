@@ -61,17 +61,19 @@ def experiment_tables(
         rule: frame rule of the run, where the experiment has none of its own.
         family: `da3` or `vggt` when the model is of that published family, else None.
     """
-    rule = entry.rule or rule
+    rule = entry.frame_rule(rule)
     picked = Selection(rows=choose(rows, rule=rule), rule=rule)
     known = {row.dataset for row in picked.rows}
     datasets = [name for name in datasets_of(entry, sorted(known, key=_place)) if name in known]
     if entry.layout == "changes":
         tables = [change_table(entry, picked, datasets)]
+    elif entry.layout == "gain":
+        tables = [gain_table(entry, picked, datasets)]
     else:
         tables = [means_table(entry, picked, datasets, family)]
     if entry.paper is not None:
         tables.append(published_table(entry, paper_table(entry.paper)))
-    if entry.layout != "costs":
+    if entry.layout not in ("costs", "gain"):
         tables.append(difference_table(entry, picked, datasets))
     return [table for table in tables if table.rows]
 
@@ -155,6 +157,58 @@ def difference_table(entry: Experiment, picked: Selection, datasets: Sequence[st
     header = ("comparison", "metric", "difference", "95 % interval", "verdict", "scenes", "pairs")
     notes = ("Intervals: bootstrap over scenes of the paired differences; seeds of a scene stay together.",)
     return Table(title=f"{entry.name}: differences", header=header, rows=tuple(rows), notes=notes)
+
+
+def gain_table(entry: Experiment, picked: Selection, datasets: Sequence[str]) -> Table:
+    """Frozen and adapted means, the gain with its interval, its share of the 8->4 gap, and the scene that lost most."""
+    ceiling = next(line for line in entry.lines if line.variant == "8to4")
+    rows = []
+    for dataset in datasets:
+        for line, base in compared_lines(entry):
+            for metric in metrics_of(entry, dataset) if line is not ceiling else ():
+                before, after = picked.of(base, dataset, metric), picked.of(line, dataset, metric)
+                gain = paired(before, after)
+                if gain is not None:
+                    gap = paired(before, picked.of(ceiling, dataset, metric)) if line.views == ceiling.views else None
+                    rows.append(_gain_row(dataset, line, metric, before, after, gain, gap))
+    header = (
+        "", "metric", "frozen", "adapted", "gain", "95 % interval", "verdict", "8->4 gap", "95 % interval", "share",
+        "worst scene", "scenes",
+    )  # fmt: skip
+    notes = (
+        "Gap: features of 8 views decoded for the same 4, minus 4 views alone; the teacher can give no more. Share: "
+        "gain over gap, where the gap's interval leaves out zero on the good side. Worst scene: mean over its seeds.",
+        *_notes(picked, datasets),
+    )
+    return Table(title=f"{entry.name}: {entry.title}", header=header, rows=tuple(rows), notes=notes)
+
+
+def _gain_row(
+    dataset: str, line: Line, metric: str, before: Sequence[Row], after: Sequence[Row], gain: Interval,
+    gap: Interval | None,
+) -> tuple[str, ...]:  # fmt: skip
+    digits, sign = DIGITS.get(metric, 3), -1 if metric in SMALLER_IS_BETTER else 1
+    old, new = entries(before), entries(after)
+    changes: dict[str, list[float]] = {}
+    for item in old.keys() & new.keys():
+        changes.setdefault(item[1], []).append(new[item] - old[item])
+    by_scene = {scene: float(np.mean(values)) for scene, values in changes.items()}
+    worst = min(by_scene, key=lambda scene: sign * by_scene[scene])
+    is_gap = gap is not None and gap.excludes_zero and sign * gap.mean > 0
+    return (
+        f"{short_name(dataset)}: {line.views} views",
+        NAMES[metric],
+        number(mean(before), metric),
+        number(mean(after), metric),
+        _signed(gain.mean, digits),
+        _bounds(gain, digits),
+        verdict(metric, gain, len(by_scene)),
+        EMPTY if gap is None else _signed(gap.mean, digits),
+        EMPTY if gap is None else _bounds(gap, digits),
+        f"{gain.mean / gap.mean:.0%}" if is_gap else EMPTY,
+        f"{worst} {_signed(by_scene[worst], digits)}",
+        str(len(by_scene)),
+    )
 
 
 def compared_lines(entry: Experiment) -> list[tuple[Line, Line]]:
@@ -268,7 +322,7 @@ def _difference_row(
         f"{short_name(dataset)}: {line.label} - {base.label}",
         NAMES[metric],
         _signed(interval.mean, digits),
-        f"[{_signed(interval.low, digits)}, {_signed(interval.high, digits)}]",
+        _bounds(interval, digits),
         verdict(metric, interval, scenes),
         str(scenes),
         str(len(shared)),
@@ -317,6 +371,10 @@ def _column_name(column: str) -> str:
 
 def _signed(value: float | None, digits: int, unit: str = "") -> str:
     return EMPTY if value is None else f"{value:+,.{digits}f}{unit}"
+
+
+def _bounds(interval: Interval, digits: int) -> str:
+    return f"[{_signed(interval.low, digits)}, {_signed(interval.high, digits)}]"
 
 
 def _piped(row: Sequence[str]) -> str:
