@@ -45,6 +45,12 @@ def test_view_draws_are_the_published_ones(frames):
         assert draw_frames(frames, 8, seed, repeat=True) == tuple(int(n) for n in wanted.split())
 
 
+def test_neighbours_are_frames_in_a_row_from_anywhere():
+    drawn = {draw_frames(16, 8, seed, repeat=False, neighbours=True) for seed in range(60)}
+    assert drawn == {tuple(range(first, first + 8)) for first in range(9)}
+    assert draw_frames(5, 8, 40, repeat=False, neighbours=True) == (0, 1, 2, 3, 4)
+
+
 @pytest.mark.parametrize("seed", AUGMENTATION)
 def test_augmentation_is_the_published_one(seed):
     mirrored, factors = AUGMENTATION[seed]

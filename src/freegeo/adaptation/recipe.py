@@ -47,6 +47,8 @@ class Recipe:
     """Whether every epoch draws new views (and augmentation) for each set."""
     repeat_views: bool
     """Whether a scene with fewer than N frames repeats some; otherwise it uses what it has."""
+    neighbours: bool
+    """Whether the views of a set are frames in a row, for models that know no others; otherwise they are random ones."""
     augmentation: Literal["none", "released"]
     """`released`: mirror the set with p = .5, brighten each view with p = .5 by U(.8, 1.2), fixed by the set's seed."""
     squash: int | None
@@ -141,7 +143,7 @@ def scene(spec: ModelSpec) -> Recipe:
     return Recipe(
         name="scene", loss=paper_loss(temperature=own.temperature), views=8, keep=None, sets_per_scene=10,
         first_seed=40, distinct_seeds=10, epochs=None, steps=100, batch=1, drop_last=False, redraw=False,
-        repeat_views=False, augmentation="none", squash=None, lr=own.scene_lr, final_lr=own.scene_lr / 1000,
+        repeat_views=False, neighbours=own.neighbours, augmentation="none", squash=None, lr=own.scene_lr, final_lr=own.scene_lr / 1000,
         warmup=0.15, weight_decay=1e-5, clip=1.0, rank=own.rank, alpha=own.rank, dropout=0.0,
     )  # fmt: skip
 
@@ -166,7 +168,8 @@ def released(name: str, dataset: str | None) -> Recipe:
     return Recipe(
         name=name, loss=released_da3_loss() if is_da3 else released_vggt_loss(), views=8, keep=None,
         sets_per_scene=row.sets, first_seed=40, distinct_seeds=row.seeds, epochs=row.epochs, steps=None,
-        batch=4 if is_da3 else 2, drop_last=True, redraw=not is_da3, repeat_views=True, augmentation="released",
+        batch=4 if is_da3 else 2, drop_last=True, redraw=not is_da3, repeat_views=True, neighbours=False,
+        augmentation="released",
         squash=518 if is_da3 else None, lr=row.lr, final_lr=row.final_lr, warmup=0.15, weight_decay=1e-5, clip=1.0,
         rank=32, alpha=32, dropout=0.1,
     )  # fmt: skip

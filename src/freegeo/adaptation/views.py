@@ -26,12 +26,16 @@ class ViewSet:
     seed: int
 
 
-def draw_frames(count: int, views: int, seed: int, *, repeat: bool) -> tuple[int, ...]:
+def draw_frames(count: int, views: int, seed: int, *, repeat: bool, neighbours: bool = False) -> tuple[int, ...]:
     """Draw the frames of a view set from `count` frames (method's fact sheet, section 3.3), ascending.
 
-    With at most `views` frames all are used; `repeat` then fills up with random repeats.
+    With at most `views` frames all are used; `repeat` then fills up with random repeats. `neighbours` (ours) draws
+    the first frame only and takes those that follow it.
     """
     generator = random.Random(seed)
+    if count > views and neighbours:
+        first = generator.randrange(count - views + 1)
+        return tuple(range(first, first + views))
     if count > views:
         return tuple(sorted(generator.sample(range(count), views)))
     frames = list(range(count))
@@ -62,7 +66,7 @@ def view_sets(frame_counts: list[int], recipe: Recipe, epoch: int = 0) -> list[V
         for number in range(recipe.sets_per_scene):
             seed = recipe.first_seed + number % recipe.distinct_seeds
             seed += EPOCH_SEED_STRIDE * epoch if recipe.redraw else 0
-            frames = draw_frames(count, recipe.views, seed, repeat=recipe.repeat_views)
+            frames = draw_frames(count, recipe.views, seed, repeat=recipe.repeat_views, neighbours=recipe.neighbours)
             sets.append(ViewSet(scene=scene, frames=frames, kept=kept_positions(len(frames), recipe.keep), seed=seed))
     return sets
 

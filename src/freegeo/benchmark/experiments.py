@@ -49,7 +49,7 @@ class Experiment:
     """Frame rule that belongs to the table; None: the run's."""
     seeds: tuple[int, ...] = PAPER_SEEDS
     every_second: bool = False
-    """Whether fewer than 8 views have to be every second one of the 8; `vggt` then stands in for `da3`, which differs."""
+    """Whether fewer than 8 views have to be every second one of the 8; `vggt` then stands in for `da3`."""
     published_dataset: str | None = None
     """The only published dataset the paper reports it on; None: all four."""
     rooms: tuple[str, ...] = ROOMS

@@ -31,6 +31,8 @@ class AdaptationDefaults:
     scene_lr: float
     """Peak learning rate of the recipe `scene`."""
     rank: int = 32
+    neighbours: bool = False
+    """Whether the model was trained on neighbouring frames only, so that its view sets are frames in a row."""
     published: Literal["da3", "vggt"] | None = None
     """Which of the two published families of settings a dataset recipe takes; None: the paper's DA3 column."""
 

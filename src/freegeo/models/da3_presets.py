@@ -95,7 +95,7 @@ def build_embedded() -> DA3:
         reference="first",
         special_tokens=1,
         weights_licence=APACHE,
-        adaptation=AdaptationDefaults(temperature=2.5, scene_lr=1e-3, rank=16),
+        adaptation=AdaptationDefaults(temperature=2.5, scene_lr=1e-3, rank=16, neighbours=True),
     )
     return DA3(config(EMBEDDED), spec)
 
