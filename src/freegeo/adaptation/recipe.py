@@ -48,7 +48,7 @@ class Recipe:
     repeat_views: bool
     """Whether a scene with fewer than N frames repeats some; otherwise it uses what it has."""
     neighbours: bool
-    """Whether the views of a set are frames in a row, for models that know no others; otherwise they are random ones."""
+    """Whether the views of a set are frames in a row, for models that know no others; else random ones."""
     augmentation: Literal["none", "released"]
     """`released`: mirror the set with p = .5, brighten each view with p = .5 by U(.8, 1.2), fixed by the set's seed."""
     squash: int | None
@@ -143,7 +143,8 @@ def scene(spec: ModelSpec) -> Recipe:
     return Recipe(
         name="scene", loss=paper_loss(temperature=own.temperature), views=8, keep=None, sets_per_scene=10,
         first_seed=40, distinct_seeds=10, epochs=None, steps=100, batch=1, drop_last=False, redraw=False,
-        repeat_views=False, neighbours=own.neighbours, augmentation="none", squash=None, lr=own.scene_lr, final_lr=own.scene_lr / 1000,
+        repeat_views=False, neighbours=own.neighbours, augmentation="none", squash=None, lr=own.scene_lr,
+        final_lr=own.scene_lr / 1000,
         warmup=0.15, weight_decay=1e-5, clip=1.0, rank=own.rank, alpha=own.rank, dropout=0.0,
     )  # fmt: skip
 
