@@ -8,8 +8,8 @@ from freegeo.cli import console
 
 
 def train_tiny(
-    *,
     output: Path,
+    *,
     views: int = 500_000,
     minutes: float | None = None,
     workers: int = 1,
@@ -35,7 +35,8 @@ def train_tiny(
     """
     from freegeo.models.precision import choose_device
     from freegeo.training.config import TrainConfig
-    from freegeo.training.loop import train
+    from freegeo.training.curve import plot_learning_curve
+    from freegeo.training.loop import LOG, train
 
     config = TrainConfig(views=views, seed=seed)
     with console.progress_bar("views", views) as update:
@@ -44,3 +45,6 @@ def train_tiny(
             progress=lambda state: update(min(state.seen, views)),
         )  # fmt: skip
     console.say(f"weights: {weights} ({console.size(weights)})")
+    log = output / LOG
+    if log.is_file():
+        console.say(f"learning curve: {plot_learning_curve(log, output / 'learning-curve.png')}")

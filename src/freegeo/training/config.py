@@ -10,12 +10,12 @@ class LossWeights:
     """Weights of the training objective (embedded-model spec, section 4)."""
 
     depth: float = 2.0
-    cell_depth: float = 4.0
+    cell_depth: float = 2.0
     gradient: float = 0.5
-    rotation: float = 3.0
-    translation: float = 1.0
+    rotation: float = 4.0
+    translation: float = 2.5
     absolute: float = 0.5
-    field_of_view: float = 4.0
+    field_of_view: float = 1.0
     rays: float = 2.0
     points: float = 2.0
     matching: float = 0.3

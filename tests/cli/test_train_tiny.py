@@ -1,0 +1,33 @@
+from functools import partial
+
+import pytest
+
+from freegeo.models.catalog import load_model
+from freegeo.training import config, loop, pool
+from freegeo.training.config import TrainConfig
+
+
+@pytest.fixture
+def small_run(monkeypatch):
+    """A run of ten steps on six rooms."""
+    small = partial(TrainConfig, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1, head_steps=2)
+    monkeypatch.setattr(config, "TrainConfig", small)
+    monkeypatch.setattr(pool, "ROOMS_PER_SHARD", 2)
+    monkeypatch.setattr(loop, "LOG_EVERY_STEPS", 2)
+    monkeypatch.setattr(loop, "EVALUATE_EVERY_VIEWS", 20)
+    monkeypatch.setattr(loop, "EVALUATION_ROOMS", 2)
+
+
+@pytest.mark.usefixtures("small_run")
+def test_training_leaves_weights_and_a_learning_curve_and_goes_on(freegeo, tmp_path):
+    run = tmp_path / "run"
+    outcome = freegeo("train-tiny", run, "--views", 40)
+    assert outcome.code == 0, outcome.err
+    assert load_model("freegeo-tiny", checkpoint=run / loop.WEIGHTS).spec.name == "freegeo-tiny"
+    assert (run / "learning-curve.png").stat().st_size > 20_000
+    assert str(run / loop.WEIGHTS) in outcome.out
+    again = freegeo("train-tiny", run, "--views", 40)
+    assert again.code == 0
+    other = freegeo("train-tiny", run, "--views", 40, "--seed", 3)
+    assert other.code == 2
+    assert "another seed" in other.sentence()
