@@ -25,6 +25,7 @@ import torch
 
 from freegeo.benchmark import sampling
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.models.api import AdaptationDefaults
 from freegeo.storage import read_json, write_json
 
 logger = logging.getLogger(__name__)
@@ -106,6 +107,13 @@ def choose_frames(rule: FrameRule, num_frames: int, views: int, seed: int) -> li
         start = seed % max(1, num_frames - sample + 1)
         frames = list(range(start, min(num_frames, start + sample)))
     return frames if views >= len(frames) else frames[::2][:views]
+
+
+def family_rule(own: AdaptationDefaults) -> FrameRule:
+    """The rule a model is evaluated with unless another one is asked for."""
+    if own.neighbours:
+        return "neighbours"
+    return "vggt" if own.published == "vggt" else "da3"
 
 
 def plain(value: Any) -> Any:

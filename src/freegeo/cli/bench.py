@@ -15,7 +15,8 @@ from freegeo.errors import FreeGeoError, UserError
 if TYPE_CHECKING:
     from freegeo.benchmark.experiments import Experiment
     from freegeo.benchmark.predict import Predictor
-    from freegeo.benchmark.tasks import Problem, Task
+    from freegeo.benchmark.tasks import FrameRule, Problem, Task
+    from freegeo.models.api import AdaptationDefaults
 
 app = App(
     name="bench", help="Published evaluation: datasets, tables, comparison with the paper.", help_format="plaintext"
@@ -46,8 +47,8 @@ class BenchOptions:
     """Only these numbers of views, such as 4,8."""
     seeds: str | None = None
     """Frame seeds instead of the experiment's, such as 43,44,45."""
-    frames: Literal["da3", "vggt", "experiment", "neighbours"] = "da3"
-    """Frame rule of the model family, where the experiment has none of its own (docs/benchmark.md)."""
+    frames: Literal["da3", "vggt", "experiment", "neighbours"] | None = None
+    """Frame rule, where the experiment has none of its own (docs/benchmark.md); default: the model family's."""
     quick: bool = False
     """10 scenes of every dataset, an experiment's first seed, 60 steps of adaptation, unless given otherwise."""
 
@@ -236,7 +237,7 @@ def _prepare(
         task
         for entry in entries
         for task in entry.tasks(
-            {name: scenes[name] for name in datasets_of(entry, names)}, rule=bench.frames,
+            {name: scenes[name] for name in datasets_of(entry, names)}, rule=_rule(bench, model.model),
             seeds=seeds or (entry.seeds[:QUICK_SEEDS] if bench.quick else None), views=_numbers(bench.views, "--views"),
         )
     ]  # fmt: skip
@@ -317,9 +318,10 @@ def _tables(experiments: Sequence[str], bench: BenchOptions) -> None:
     from freegeo.storage import atomic_path
 
     rows = read_results(bench.output)
-    family = _family(rows[0].model) if rows else None
+    family = _adaptation(rows[0].model).published if rows else None
+    rule = _rule(bench, rows[0].model) if rows else "da3"
     for entry in chosen(experiments):
-        tables = experiment_tables(entry, rows, rule=bench.frames, family=family)
+        tables = experiment_tables(entry, rows, rule=rule, family=family)
         if not _has_own(entry, tables):
             continue
         for table in tables:
@@ -334,10 +336,17 @@ def _has_own(entry: Experiment, tables: Sequence) -> bool:
     return any("published" not in table.title for table in tables)
 
 
-def _family(model: str) -> str | None:
+def _adaptation(model: str) -> AdaptationDefaults:
     from freegeo.models.catalog import build_empty
 
-    return build_empty(model).spec.adaptation.published
+    return build_empty(model).spec.adaptation
+
+
+def _rule(bench: BenchOptions, model: str) -> FrameRule:
+    """Return the frame rule of a run: the one asked for, or that of the model's family."""
+    from freegeo.benchmark.tasks import family_rule
+
+    return bench.frames or family_rule(_adaptation(model))
 
 
 def _figures(bench: BenchOptions) -> None:
