@@ -10,7 +10,7 @@ from freegeo.cli import console
 def train_tiny(
     output: Path,
     *,
-    views: int = 500_000,
+    views: int = 430_000,
     minutes: float | None = None,
     workers: int = 1,
     device: str = "cpu",

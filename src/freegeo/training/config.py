@@ -39,7 +39,7 @@ class Stage:
 class TrainConfig:
     """Train the embedded model on generated rooms."""
 
-    views: int = 500_000
+    views: int = 430_000
     """Views the model learns from, counted with repetition; the last `cooldown` of them lower the learning rate."""
     seed: int = 0
     side: int = 64
@@ -56,7 +56,7 @@ class TrainConfig:
     """AdamW, for the dense head and the last linear layers. Their inputs have a large mean, so that a step moves all
     outputs of a layer together: at 2e-3 rectifiers died within a few hundred steps, and the answers were constant."""
     warmup_views: int = 6_000
-    cooldown: float = 0.72
+    cooldown: float = 0.675
     ema: float = 0.99
     clip: float = 1.0
     pairs_until: int = 25_000
