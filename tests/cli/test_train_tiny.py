@@ -10,7 +10,7 @@ from freegeo.training.config import TrainConfig
 @pytest.fixture
 def small_run(monkeypatch):
     """A run of ten steps on six rooms."""
-    small = partial(TrainConfig, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1, head_steps=2)
+    small = partial(TrainConfig, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1)
     monkeypatch.setattr(config, "TrainConfig", small)
     monkeypatch.setattr(pool, "ROOMS_PER_SHARD", 2)
     monkeypatch.setattr(loop, "LOG_EVERY_STEPS", 2)

@@ -27,7 +27,7 @@ loop.SAVE_EVERY_S = 0.0
 def progress(state):
     if state.step == 4:
         os.kill(os.getpid(), signal.SIGKILL)
-config = TrainConfig(views=40, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1, head_steps=2)
+config = TrainConfig(views=40, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1)
 loop.train(config, Path(sys.argv[1]), progress=progress)
 """
 
@@ -69,15 +69,6 @@ def test_a_larger_budget_goes_on_from_the_plateau(tmp_path, small_config, whole_
     # The steps after the plateau are taken again, now without the cool-down, and the new budget is used up.
     assert steps[0][0] == plateau["counters"][0] + 1
     assert steps[-1][1] >= 60
-
-
-def test_a_finished_run_is_not_trained_again(tmp_path, small_config, whole_run, monkeypatch):
-    folder = tmp_path / "again"
-    shutil.copytree(whole_run.parent, folder)
-    before = (folder / loop.WEIGHTS).read_bytes()
-    monkeypatch.setattr(loop, "train_head", pytest.fail)
-    train(small_config, folder)
-    assert (folder / loop.WEIGHTS).read_bytes() == before
 
 
 def test_other_settings_need_another_folder(small_config, whole_run):

@@ -67,8 +67,6 @@ class TrainConfig:
     """Views before the images reach their full size; at three quarters of it a view costs 40 % less."""
     depth_views: int = 8
     """Views that the dense head learns from in one step, at most one of each sample."""
-    head_steps: int = 300
-    """Steps at the end in which the dense head alone learns, from every view, on features that stay as they are."""
     ray_branch_every: int = 8
     """Steps between two updates of the ray branch, which learns on detached features."""
     weights: LossWeights = LossWeights()

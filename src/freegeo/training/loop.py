@@ -12,17 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import safe_open
 from torch import nn
 
 from freegeo import __version__
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.models.da3 import DA3
 from freegeo.storage import locked, read_json, write_json, write_tensors
 from freegeo.training.batches import Batch, draw_batch
 from freegeo.training.config import TrainConfig
 from freegeo.training.evaluate import evaluate
-from freegeo.training.head import train_head
 from freegeo.training.objective import objective, zero_motion_rotation
 from freegeo.training.pool import ASPECTS, Pool
 from freegeo.training.state import PLATEAU, PLATEAU_LR, STATE, State, averaged, new_state, resume, save
@@ -32,7 +29,6 @@ logger = logging.getLogger(__name__)
 
 CONFIG, LOG, WEIGHTS = "config.json", "log.jsonl", "freegeo-tiny.safetensors"
 GROW_EVERY_STEPS = 40
-HEAD_LOG_EVERY_STEPS = 10
 LOG_EVERY_STEPS = 100
 LOG_MEMORY = 0.98
 SAVE_EVERY_S = 120.0
@@ -51,11 +47,10 @@ def train(
 ) -> Path:
     """Train until the view budget or the time limit of this leg is used up; return the weight file.
 
-    When the budget is used up the dense head learns on for `head_steps` steps, unless the leg has ended. The same
-    call continues a stopped run: with one worker it ends with the same tensors as a run that was never stopped. A
-    larger `views` continues from the plateau before the cool-down. `workers` processes of one thread each change the
-    shared weights without locks; on another device than the CPU there is one. UserError when the folder holds a run
-    with other settings; FreeGeoError when a loss is not finite or a worker dies.
+    The same call continues a stopped run: with one worker it ends with the same tensors as a run that was never
+    stopped. A larger `views` continues from the plateau before the cool-down. `workers` processes of one thread each
+    change the shared weights without locks; on another device than the CPU there is one. UserError when the folder
+    holds a run with other settings; FreeGeoError when a loss is not finite or a worker dies.
     """
     if workers < 1 or (workers > 1 and device != "cpu"):
         raise UserError(f"cannot train with {workers} workers on {device}. Use one, or several on the cpu.")
@@ -73,24 +68,7 @@ def train(
                 trainer.keep_record()
                 progress(state)
         save(state, config, folder / STATE)
-        model = averaged(state).to(device)
-        finished = state.seen >= config.views and time.monotonic() < deadline
-        if finished and exported_views(folder / WEIGHTS) != state.seen:
-            fill(pool, state.step, render_new=True)
-            train_head(model, pool, config, progress=head_record(state, folder))
-        elif finished:
-            return folder / WEIGHTS
-        return export(model, state, config, folder / WEIGHTS, finished=finished)
-
-
-def head_record(state: State, folder: Path) -> Callable[[int, dict[str, float]], None]:
-    """Return a function that logs every tenth step of the dense head."""
-
-    def record(step: int, terms: dict[str, float]) -> None:
-        if step % HEAD_LOG_EVERY_STEPS == 0:
-            append_log(state, folder, "head", {"head_step": step, **{k: round(v, 5) for k, v in terms.items()}})
-
-    return record
+        return export(state, config, folder / WEIGHTS)
 
 
 @contextmanager
@@ -159,14 +137,10 @@ class Trainer:
 
     def log(self, kind: str, values: dict[str, Any]) -> None:
         """Append one line to the run's log."""
-        append_log(self.state, self.folder, kind, values)
-
-
-def append_log(state: State, folder: Path, kind: str, values: dict[str, Any]) -> None:
-    """Append one line to a run's log."""
-    counters = {"step": state.step, "views": state.seen, "cpu_s": round(state.cpu_seconds, 1)}
-    with (folder / LOG).open("a", encoding="utf-8") as file:
-        file.write(json.dumps({"kind": kind, **counters, **values}) + "\n")
+        state = self.state
+        counters = {"step": state.step, "views": state.seen, "cpu_s": round(state.cpu_seconds, 1)}
+        with (self.folder / LOG).open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"kind": kind, **counters, **values}) + "\n")
 
 
 def apply_gradients(state: State, config: TrainConfig) -> None:
@@ -215,25 +189,15 @@ def open_pool(config: TrainConfig, state: State, folder: Path, device: str) -> P
     return pool
 
 
-def export(model: DA3, state: State, config: TrainConfig, path: Path, *, finished: bool) -> Path:
-    """Write a model in half precision, under the official DA3 names, with where it comes from."""
-    tensors = {f"model.{name}": value.half().cpu() for name, value in model.named_parameters()}
+def export(state: State, config: TrainConfig, path: Path) -> Path:
+    """Write the averaged weights in half precision, under the official DA3 names, with where they come from."""
+    tensors = {f"model.{name}": value.half().cpu() for name, value in state.average.items()}
     metadata = {
         "freegeo": __version__,
         "views": str(state.seen),
         "step": str(state.step),
         "cpu_seconds": str(round(state.cpu_seconds)),
-        "finished": str(finished),
         "config": json.dumps(asdict(config)),
     }
     write_tensors(path, tensors, metadata)
     return path
-
-
-def exported_views(path: Path) -> int | None:
-    """Return the views behind a weight file that a finished run left; None when there is none."""
-    if not path.is_file():
-        return None
-    with safe_open(path, framework="pt") as file:
-        metadata = file.metadata() or {}
-    return int(metadata["views"]) if metadata.get("finished") == "True" else None
