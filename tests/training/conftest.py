@@ -15,7 +15,7 @@ def small_shards(monkeypatch):
 
 @pytest.fixture(scope="session")
 def small_config():
-    return TrainConfig(views=40, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1)
+    return TrainConfig(views=40, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1, cooldown=0.25)
 
 
 @pytest.fixture(scope="session")

@@ -27,7 +27,7 @@ loop.SAVE_EVERY_S = 0.0
 def progress(state):
     if state.step == 4:
         os.kill(os.getpid(), signal.SIGKILL)
-config = TrainConfig(views=40, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1)
+config = TrainConfig(views=40, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1, cooldown=0.25)
 loop.train(config, Path(sys.argv[1]), progress=progress)
 """
 
