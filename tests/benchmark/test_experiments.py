@@ -61,6 +61,7 @@ def test_the_gain_compares_the_same_frames():
     for name in ("gain", "long-sequence", "features", "main"):
         tasks = EXPERIMENTS[name].tasks({"procedural-big": ["1"]}, rule="neighbours")
         assert {task.rule for task in tasks} == {"neighbours"}
+        assert {task.seed for task in tasks} == {43, 44, 45}, "tables of one rule share their samples"
 
 
 def test_every_published_line_with_a_place_has_numbers():

@@ -60,6 +60,10 @@ class Experiment:
             return self.rule
         return "vggt" if self.every_second and rule == "da3" else rule
 
+    def frame_seeds(self, rule: FrameRule) -> tuple[int, ...]:
+        """The seeds of the table in a run of this rule; under a common rule all tables must share their samples."""
+        return PAPER_SEEDS if rule == "neighbours" else self.seeds
+
     def lines_for(self, dataset: str) -> list[Line]:
         """The lines that can be computed on a dataset: generated rooms have 16 frames."""
         return [line for line in self.lines if not dataset.startswith(PREFIX) or line.views <= FRAMES]
@@ -82,7 +86,7 @@ class Experiment:
             for line in self.lines_for(dataset)
             if views is None or line.views in views
             for scene in names
-            for seed in (self.seeds if seeds is None else seeds)
+            for seed in (self.frame_seeds(rule) if seeds is None else seeds)
         ]  # fmt: skip
 
 

@@ -233,12 +233,14 @@ def _prepare(
     limit = bench.scenes or (QUICK_SCENES if bench.quick else None)
     seeds = _numbers(bench.seeds, "--seeds")
     scenes = {name: listed_scenes(bench.data, name, limit) for name in names}
+    rule = _rule(bench, model.model)
     tasks = [
         task
         for entry in entries
         for task in entry.tasks(
-            {name: scenes[name] for name in datasets_of(entry, names)}, rule=_rule(bench, model.model),
-            seeds=seeds or (entry.seeds[:QUICK_SEEDS] if bench.quick else None), views=_numbers(bench.views, "--views"),
+            {name: scenes[name] for name in datasets_of(entry, names)}, rule=rule,
+            seeds=seeds or (entry.frame_seeds(rule)[:QUICK_SEEDS] if bench.quick else None),
+            views=_numbers(bench.views, "--views"),
         )
     ]  # fmt: skip
     steps = model.steps or (QUICK_STEPS if bench.quick and model.epochs is None else None)
