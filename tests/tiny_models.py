@@ -100,3 +100,8 @@ def _spec(name: str, layers: tuple[int, ...], special: int) -> ModelSpec:
         name=name, patch_size=PATCH, default_side=4 * PATCH, loss_layers=layers, reference="first",
         special_tokens=special, weights_licence="none", adaptation=DEFAULTS,
     )  # fmt: skip
+
+
+def tensors(result) -> list[torch.Tensor]:
+    """The tensors of a finished run's adapter."""
+    return [parameter.detach() for parameter in result.adapter.parameters()]

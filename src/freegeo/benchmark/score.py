@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from freegeo.benchmark.adapters import FINISHED, FOLDER
+from freegeo.benchmark.cloud import f1_rel5
 from freegeo.benchmark.depth import score_depth
 from freegeo.benchmark.evaluate import (
     GROUND_TRUTH,
@@ -24,9 +25,10 @@ from freegeo.benchmark.evaluate import (
     score_scene_poses,
     score_scene_surface,
 )
+from freegeo.benchmark.frames import require_prediction
 from freegeo.benchmark.predict import problem_of
 from freegeo.benchmark.results import Row, rows_of, write_results
-from freegeo.benchmark.scene_score import evaluate
+from freegeo.benchmark.scene_score import at_size
 from freegeo.benchmark.stored import Stored, read_stored
 from freegeo.benchmark.tasks import (
     MEASURED_FILE,
@@ -190,7 +192,7 @@ def _metrics(
 
     parts = {"poses": cameras, "surface": surface}
     if chosen.depth_z is not None:
-        parts["points"] = lambda: {"f1_rel5": evaluate(stored.prediction, chosen)["f1_rel5"]}
+        parts["points"] = lambda: _point_metrics(chosen, stored)
     parts["depth"] = lambda: _depth_metrics(chosen, stored)
     for name, work in parts.items():
         for problem in run_each(
@@ -200,6 +202,13 @@ def _metrics(
         ):
             failed[problem.what] = problem.reason
     return metrics, failed
+
+
+def _point_metrics(chosen: Scene, stored: Stored) -> dict[str, float]:
+    depth_z, T_cam_world, K = require_prediction(chosen, stored.prediction)
+    assert chosen.depth_z is not None and chosen.K is not None and chosen.T_cam_world is not None
+    depth_true, K_true = at_size(chosen.depth_z, chosen.K, (depth_z.shape[-2], depth_z.shape[-1]))
+    return {"f1_rel5": f1_rel5(depth_z, K, T_cam_world, depth_true, K_true, chosen.T_cam_world).fscore}
 
 
 def _depth_metrics(chosen: Scene, stored: Stored) -> dict[str, float]:
