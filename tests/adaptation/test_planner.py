@@ -130,12 +130,15 @@ def test_activations_per_token_are_what_autograd_keeps(ffn, precision, dropout):
         {"cache_teacher": False, "share_prefix": False},
         {"cache_place": "disk", "recompute_blocks": True},
         {"half_cache": True},
+        {"hold": 1.0},
     ],
     ids=str,
 )
 def test_the_peak_is_that_of_the_tensors_alive(options, tmp_path):
     model = wide_da3()
-    recipe = scene(model.spec).changed(epochs=2, batch=2, sets_per_scene=2, distinct_seeds=2, rank=8)
+    options = dict(options)
+    changes = {"epochs": 2, "batch": 2, "sets_per_scene": 2, "distinct_seeds": 2, "rank": 8}
+    recipe = scene(model.spec).changed(**changes, hold=options.pop("hold", None))
     images = torch.rand(24, 3, 128, 128, generator=torch.Generator().manual_seed(0))
     engine = Engine(cache_folder=tmp_path, **options)
     plan = plan_adaptation(model, [(24, (128, 128))], recipe, seed=42, engine=engine)

@@ -37,14 +37,17 @@ def view_key(view_set: ViewSet, position: int, recipe: Recipe) -> ViewKey:
 
 
 def accesses(steps: Iterable[Sequence[Visit]], recipe: Recipe, *, teacher_once: bool) -> Iterator[Access]:
-    """List what teacher and student read in the steps, in order; the teacher once per view set, or in every visit."""
+    """List what is read, in order: by the teacher (once per view set, or in every visit), the student, and hold."""
     known: set[SetKey] = set()
-    for visit in (visit for visits in steps for visit in visits):
-        key = set_key(visit.view_set, recipe)
-        if not teacher_once or key not in known:
+    for visits in steps:
+        for visit in visits:
+            key = set_key(visit.view_set, recipe)
+            if not teacher_once or key not in known:
+                yield visit.view_set, tuple(range(len(visit.view_set.frames)))
+            known.add(key)
+            yield visit.view_set, visit.view_set.kept
+        for visit in visits if recipe.hold else ():
             yield visit.view_set, tuple(range(len(visit.view_set.frames)))
-        known.add(key)
-        yield visit.view_set, visit.view_set.kept
 
 
 @torch.no_grad()

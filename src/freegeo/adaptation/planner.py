@@ -166,44 +166,67 @@ class _Job:
         self.tokens = [(h // patch) * (w // patch) + self.shape.special for _, (h, w) in scenes]
         self.steps = schedule([count for count, _ in scenes], recipe, seed)
         self.sets = list(dict.fromkeys(visit.view_set for visits in self.steps for visit in visits))
+        self.teacher_tokens = max(len(s.frames) * self.tokens[s.scene] for s in self.sets)
 
     def student_tokens(self, engine: Engine) -> int:
         """Tokens of the largest micro-batch."""
         return max(len(s.kept) * self.tokens[s.scene] for s in self.sets) * engine.micro_batch
 
     def parts(self, engine: Engine) -> Iterator[tuple[str, int]]:
-        """Yield what is on the device when it is fullest: in the teacher's pass or in the student's."""
-        shape, precision, recipe = self.shape, engine.precision, self.recipe
-        teacher_tokens = max(len(s.frames) * self.tokens[s.scene] for s in self.sets)
-        student_tokens = self.student_tokens(engine)
+        """Yield what is on the device when it is fullest: in the teacher's pass or in one with gradients."""
+        shape, precision = self.shape, engine.precision
         yield "weights", footprint.weights(shape, half=engine.half_weights)
         yield "adapter and optimiser", footprint.trained(self.trained)
         prefix, targets = self.cache(engine) if engine.cache_place == "device" else (0, 0)
         targets_now = max(self._targets(s, visits=1) for s in self.sets)
         teacher = footprint.teacher(
-            shape, precision, tokens=teacher_tokens, layers=self.layers, stored_half=engine.half_weights
+            shape, precision, tokens=self.teacher_tokens, layers=self.layers, stored_half=engine.half_weights
         )
-        teacher += footprint.token_bytes(shape, 2 * teacher_tokens) + targets_now
-        student, backward = footprint.student(
-            shape, precision, tokens=student_tokens, layers=self.layers, rank=recipe.rank, dropout=recipe.dropout > 0,
-            recompute=engine.recompute_blocks, stored_half=engine.half_weights, device=engine.device,
-        )  # fmt: skip
-        losses = footprint.losses(
-            shape, tokens=student_tokens, layers=self.layers, triplets=self._triplets(), batch=engine.micro_batch,
-            device=engine.device,
-        )  # fmt: skip
-        inputs = footprint.token_bytes(shape, student_tokens)
-        inputs += 0 if targets and engine.micro_batch == 1 else targets_now * engine.micro_batch
+        teacher += footprint.token_bytes(shape, 2 * self.teacher_tokens) + targets_now
+        learning = self._student(engine, 0 if targets and engine.micro_batch == 1 else targets_now)
+        if self.recipe.hold:
+            learning = max(learning, self._hold(engine), key=lambda parts: sum(size for _, size in parts))
         yield "tokens of images", prefix
         # While the teacher runs for the last time, the targets that it makes are still missing.
-        if teacher - targets_now > student + max(losses, backward) + inputs:
+        if teacher - targets_now > sum(size for _, size in learning):
             yield "teacher targets", max(0, targets - targets_now)
             yield "teacher's pass", teacher
             return
         yield "teacher targets", targets
-        yield "student's pass", student
-        yield ("losses", losses) if losses > backward else ("backward pass", backward)
-        yield "inputs of a step", inputs
+        yield from learning
+
+    def _student(self, engine: Engine, targets: int) -> list[tuple[str, int]]:
+        """Return what the student's pass over a micro-batch takes, with `targets` bytes for each of its view sets."""
+        tokens = self.student_tokens(engine)
+        passed, backward = self._gradients(engine, tokens)
+        losses = footprint.losses(
+            self.shape, tokens=tokens, layers=self.layers, triplets=self._triplets(), batch=engine.micro_batch,
+            device=engine.device,
+        )  # fmt: skip
+        return [
+            ("student's pass", passed),
+            ("losses", losses) if losses > backward else ("backward pass", backward),
+            ("inputs of a step", footprint.token_bytes(self.shape, tokens) + targets * engine.micro_batch),
+        ]
+
+    def _hold(self, engine: Engine) -> list[tuple[str, int]]:
+        """Return what the pass over all views of a set takes; their frozen features are gone before it goes back."""
+        tokens = self.teacher_tokens
+        passed, backward = self._gradients(engine, tokens)
+        frozen = footprint.features(self.shape, tokens, self.layers)
+        return [
+            ("pass over all views", passed),
+            ("frozen features", frozen) if frozen > backward else ("backward pass", backward),
+            ("inputs of a step", footprint.token_bytes(self.shape, tokens)),
+        ]
+
+    def _gradients(self, engine: Engine, tokens: int) -> tuple[int, int]:
+        """Return what a pass with gradients leaves, and what its backward pass adds."""
+        return footprint.student(
+            self.shape, engine.precision, tokens=tokens, layers=self.layers, rank=self.recipe.rank,
+            dropout=self.recipe.dropout > 0, recompute=engine.recompute_blocks, stored_half=engine.half_weights,
+            device=engine.device,
+        )  # fmt: skip
 
     def cache(self, engine: Engine) -> tuple[int, int]:
         """Bytes of the tokens and of the targets that are kept, each at its fullest moment."""

@@ -49,6 +49,8 @@ class Recipe:
     """Whether a scene with fewer than N frames repeats some; otherwise it uses what it has."""
     neighbours: bool
     """Whether the views of a set are frames in a row, for models that know no others; else random ones."""
+    hold: float
+    """Weight of staying, with all N views, where the frozen model's features are; 0, as in the paper: no such term."""
     augmentation: Literal["none", "released"]
     """`released`: mirror the set with p = .5, brighten each view with p = .5 by U(.8, 1.2), fixed by the set's seed."""
     squash: int | None
@@ -71,6 +73,8 @@ class Recipe:
                 raise UserError(f"--keep {self.keep} must ascend within 0..{self.views - 1}.")
             if not 2 <= len(kept) < self.views:
                 raise UserError(f"--keep must name at least 2 and fewer than {self.views} of the views.")
+        if self.hold < 0:
+            raise UserError(f"--hold must be 0 or more, got {self.hold}.")
         for name in ("lr", "rank", "alpha", "batch", "sets_per_scene"):
             if not getattr(self, name) > 0:
                 raise UserError(f"recipe setting {name} must be positive, got {getattr(self, name)}.")
@@ -143,9 +147,9 @@ def scene(spec: ModelSpec) -> Recipe:
     return Recipe(
         name="scene", loss=paper_loss(temperature=own.temperature), views=8, keep=None, sets_per_scene=10,
         first_seed=40, distinct_seeds=10, epochs=None, steps=100, batch=1, drop_last=False, redraw=False,
-        repeat_views=False, neighbours=own.neighbours, augmentation="none", squash=None, lr=own.scene_lr,
-        final_lr=own.scene_lr / 1000,
-        warmup=0.15, weight_decay=1e-5, clip=1.0, rank=own.rank, alpha=own.rank, dropout=0.0,
+        repeat_views=False, neighbours=own.neighbours, hold=0.0, augmentation="none", squash=None,
+        lr=own.scene_lr, final_lr=own.scene_lr / 1000, warmup=0.15, weight_decay=1e-5, clip=1.0,
+        rank=own.rank, alpha=own.rank, dropout=0.0,
     )  # fmt: skip
 
 
@@ -170,7 +174,7 @@ def released(name: str, dataset: str | None) -> Recipe:
         name=name, loss=released_da3_loss() if is_da3 else released_vggt_loss(), views=8, keep=None,
         sets_per_scene=row.sets, first_seed=40, distinct_seeds=row.seeds, epochs=row.epochs, steps=None,
         batch=4 if is_da3 else 2, drop_last=True, redraw=not is_da3, repeat_views=True, neighbours=False,
-        augmentation="released",
+        hold=0.0, augmentation="released",
         squash=518 if is_da3 else None, lr=row.lr, final_lr=row.final_lr, warmup=0.15, weight_decay=1e-5, clip=1.0,
         rank=32, alpha=32, dropout=0.1,
     )  # fmt: skip

@@ -18,7 +18,7 @@ from freegeo.adaptation.bank import ViewBank, accesses
 from freegeo.adaptation.dropout import pack_dropout
 from freegeo.adaptation.engine import Engine
 from freegeo.adaptation.images import SceneImages
-from freegeo.adaptation.losses import adaptation_loss, require_finite
+from freegeo.adaptation.losses import adaptation_loss, feature_distance, require_finite
 from freegeo.adaptation.recipe import Recipe
 from freegeo.adaptation.state import read_state, run_identity, write_state
 from freegeo.adaptation.teacher import Comparison, TeacherBank, stacked
@@ -204,14 +204,13 @@ class _Run:
         with self._training(step):
             for tokens, comparison in self._batches(visits):
                 share = len(tokens.tokens) / len(visits)
-                loss, terms = self._compare(tokens, comparison)
-                # A loss that is not finite shall leave no finite gradient behind.
-                factor = torch.where(loss.detach().isfinite(), share, torch.nan)
-                self.scaler.scale(loss * factor).backward()
-                parts.append({name: term * share for name, term in terms.items()})
+                parts.append(self._backward(*self._compare(tokens, comparison), share))
                 # What the next view set needs shall not meet what this one needed.
-                del tokens, comparison, loss
-        terms = {name: torch.stack([part[name] for part in parts]).sum() for name in parts[0]}
+                del tokens, comparison
+            for visit in visits if self.recipe.hold else ():
+                parts.append(self._backward(*self._hold(visit), 1 / len(visits)))
+        names = dict.fromkeys(name for part in parts for name in part)
+        terms = {name: torch.stack([part[name] for part in parts if name in part]).sum() for name in names}
         self._update(step, terms)
         self.curve.append(terms)
         return terms
@@ -242,6 +241,25 @@ class _Run:
         return adaptation_loss(
             levels, comparison.targets, comparison.draws, self.recipe.loss, precision=comparison.precision
         )
+
+    def _hold(self, visit: Visit) -> tuple[Tensor, dict[str, Tensor]]:
+        """Compare the adapted features of all views with the frozen ones: what needs no correction shall stay."""
+        tokens = self.bank.tokens(visit.view_set, range(len(visit.view_set.frames)))
+        model = self.adapter.model
+        aggregate = partial(model.aggregate, tokens, layers=model.spec.loss_layers, reference="first")
+        with self.arithmetic():
+            with torch.no_grad(), self.adapter.off():
+                frozen = aggregate().levels
+            adapted = aggregate().levels
+        loss = self.recipe.hold * feature_distance(adapted, frozen, self.recipe.loss)[0]
+        return loss, {"hold": loss.detach(), "total": loss.detach()}
+
+    def _backward(self, loss: Tensor, terms: dict[str, Tensor], share: float) -> dict[str, Tensor]:
+        """Add a loss's share of the step to the gradients, and return the share of its terms."""
+        # A loss that is not finite shall leave no finite gradient behind.
+        factor = torch.where(loss.detach().isfinite(), share, torch.nan)
+        self.scaler.scale(loss * factor).backward()
+        return {name: term * share for name, term in terms.items()}
 
     def _update(self, step: int, terms: dict[str, Tensor]) -> None:
         for group in self.optimiser.param_groups:

@@ -74,6 +74,8 @@ class BenchModel:
     """Passes over all view sets instead of the recipe's length."""
     lr: float | None = None
     """Peak learning rate."""
+    hold: float | None = None
+    """Weight of keeping what the model says with all views as it is; default: 0, as in the paper."""
     adapt_per: Literal["dataset", "scene"] = "dataset"
     """One adapter for all scenes of a dataset, or one for each."""
     adapt_seed: int = 42
@@ -248,9 +250,9 @@ def _prepare(
         Setup(
             data=bench.data, out=bench.output, model=model.model, checkpoint=model.checkpoint, device=model.device,
             precision=model.precision, recipe=model.recipe,
-            changes={"steps": steps, "epochs": model.epochs, "lr": model.lr}, adapt_per=model.adapt_per,
-            adapt_seed=model.adapt_seed, epoch=model.epoch, given_cameras=model.given_cameras, scenes=scenes,
-            overwrite=overwrite,
+            changes={"steps": steps, "epochs": model.epochs, "lr": model.lr, "hold": model.hold},
+            adapt_per=model.adapt_per, adapt_seed=model.adapt_seed, epoch=model.epoch,
+            given_cameras=model.given_cameras, scenes=scenes, overwrite=overwrite,
         )
     )  # fmt: skip
     use_few_threads(predictor.model)

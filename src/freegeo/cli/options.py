@@ -105,6 +105,8 @@ class RecipeOptions:
     """Peak learning rate."""
     rank: int | None = None
     """Rank of the adapter."""
+    hold: float | None = None
+    """Weight of keeping what the model says with all views as it is (0: the paper; 1 where more views get worse)."""
 
     def build(self, spec: ModelSpec) -> Recipe:
         """Return the recipe for a model."""
@@ -113,7 +115,7 @@ class RecipeOptions:
         named = recipes.named(self.recipe, spec, self.dataset)
         return named.changed(
             views=self.views, keep=parse_keep(self.keep), steps=self.steps, epochs=self.epochs,
-            sets_per_scene=self.sets, lr=self.lr, rank=self.rank,
+            sets_per_scene=self.sets, lr=self.lr, rank=self.rank, hold=self.hold,
         )  # fmt: skip
 
 

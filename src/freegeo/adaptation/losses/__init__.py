@@ -4,7 +4,7 @@ Reading order: `config` (the versions), `sampling` (which tokens), `targets` (wh
 (the whole loss), then the three terms `intra`, `relational`, `divergence`.
 """
 
-from freegeo.adaptation.losses.assemble import adaptation_loss, require_finite, teacher_spread
+from freegeo.adaptation.losses.assemble import adaptation_loss, feature_distance, require_finite, teacher_spread
 from freegeo.adaptation.losses.config import LossConfig, paper_loss, released_da3_loss, released_vggt_loss
 from freegeo.adaptation.losses.divergence import Precision, choose_precision
 from freegeo.adaptation.losses.sampling import StepDraws, TokenDraw, draw_tokens
@@ -21,6 +21,7 @@ __all__ = [
     "anchor_features",
     "choose_precision",
     "draw_tokens",
+    "feature_distance",
     "paper_loss",
     "released_da3_loss",
     "released_vggt_loss",

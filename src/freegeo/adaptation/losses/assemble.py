@@ -46,7 +46,7 @@ def adaptation_loss(
             f"The student's features come from layers {sorted(student_levels)}, the teacher's from "
             f"{sorted(teacher.kept)}; ask both branches for the same layers."
         )
-    total, terms = _intra(student_levels, teacher, config)
+    total, terms = feature_distance(student_levels, teacher.kept, config)
     cross: list[Tensor] = []
     if config.uses_angles or config.uses_distances:
         layer = max(student_levels)
@@ -75,13 +75,14 @@ def adaptation_loss(
     return total, {name: term.detach() for name, term in terms.items()}
 
 
-def _intra(
-    student_levels: Mapping[int, Level], teacher: TeacherTargets, config: LossConfig
+def feature_distance(
+    levels: Mapping[int, Level], wanted: Mapping[int, Level], config: LossConfig
 ) -> tuple[Tensor, dict[str, Tensor]]:
+    """The intra loss of features against others of the same views, mean over layers, and its parts (see above)."""
     per_layer = []
-    for layer, (patch, special) in student_levels.items():
-        kept_patch, kept_special = teacher.kept[layer]
-        pairs = [(patch, kept_patch), (intra_special(config, special), intra_special(config, kept_special))]
+    for layer, (patch, special) in levels.items():
+        wanted_patch, wanted_special = wanted[layer]
+        pairs = [(patch, wanted_patch), (intra_special(config, special), intra_special(config, wanted_special))]
         per_layer.append(
             intra_loss(
                 pairs,
