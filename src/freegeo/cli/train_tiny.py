@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from freegeo.cli import console
+from freegeo.training.config import TrainConfig
 
 
 def train_tiny(
     output: Path,
     *,
-    views: int = 430_000,
+    views: int = TrainConfig.views,
     minutes: float | None = None,
     workers: int = 1,
     device: str = "cpu",
@@ -34,7 +35,6 @@ def train_tiny(
         Seed of weights, rooms and batches.
     """
     from freegeo.models.precision import choose_device
-    from freegeo.training.config import TrainConfig
     from freegeo.training.curve import plot_learning_curve
     from freegeo.training.loop import LOG, train
 

@@ -48,7 +48,7 @@ def draw_batch(
     views = stage.views[int(torch.randint(len(stage.views), (), generator=generator))]
     picks = pool.draw(max(1, config.views_per_step // views), generator)
     parts = [
-        (rooms, room, torch.tensor(window(pool.frames, views, stage.max_stride, generator))) for rooms, room in picks
+        (rooms, room, torch.tensor(window(rooms.frames, views, stage.max_stride, generator))) for rooms, room in picks
     ]
     gathered = Rooms(
         **{

@@ -39,15 +39,15 @@ class Stage:
 class TrainConfig:
     """Train the embedded model on generated rooms."""
 
-    views: int = 430_000
+    views: int = 700_000
     """Views the model learns from, counted with repetition; the last `cooldown` of them lower the learning rate."""
     seed: int = 0
     side: int = 64
     """Longest image side in pixels."""
     views_per_step: int = 48
-    rooms: int = 3_840
+    rooms: int = 7_680
     """Rooms in the pool; they are rendered a shard at a time while training goes on."""
-    frames: int = 10
+    frames: int = 16
     matrix_lr: float = 4e-3
     """Muon, for the matrices of the blocks and the camera decoder."""
     other_lr: float = 1e-3
@@ -56,13 +56,13 @@ class TrainConfig:
     """AdamW, for the dense head and the last linear layers. Their inputs have a large mean, so that a step moves all
     outputs of a layer together: at 2e-3 rectifiers died within a few hundred steps, and the answers were constant."""
     warmup_views: int = 6_000
-    cooldown: float = 0.675
+    cooldown: float = 0.85
     ema: float = 0.99
     clip: float = 1.0
     pairs_until: int = 25_000
     """Views before windows reach beyond 2 or 3 neighbouring frames."""
     short_until: int = 60_000
-    """Views before windows reach 8 views and stride 3."""
+    """Views before windows reach 16 views and stride 3."""
     small_until: int = 270_000
     """Views before the images reach their full size; at three quarters of it a view costs 40 % less."""
     depth_views: int = 8
@@ -78,7 +78,7 @@ class TrainConfig:
             return Stage(views=(2, 3), max_stride=1, side=side)
         if seen < self.short_until:
             return Stage(views=(2, 3, 4), max_stride=2, side=side)
-        return Stage(views=(2, 4, 4, 6, 8, 8), max_stride=3, side=side)
+        return Stage(views=(2, 4, 4, 4, 6, 8, 8, 8, 12, 16), max_stride=3, side=side)
 
     def rate(self, seen: int) -> float:
         """Return the factor on all learning rates: warm-up, plateau, quadratic cool-down to zero."""

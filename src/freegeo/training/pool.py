@@ -29,6 +29,11 @@ class Rooms:
     fov_vh: Tensor
     """(R, F, 2) float32, radians, vertical first."""
 
+    @property
+    def frames(self) -> int:
+        """Views of each room."""
+        return self.images.shape[1]
+
 
 def image_size(side: int, aspect: tuple[int, int], patch: int) -> tuple[int, int]:
     """Return height and width of an aspect at a longest side, in whole patches (ties upwards, as the model resizes)."""
