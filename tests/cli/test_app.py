@@ -202,8 +202,10 @@ def test_table_wraps_its_last_column():
 
 def test_progress_without_a_terminal_is_a_line_per_tenth(capsys):
     with console.progress_bar("steps", 40) as update:
+        update(0, "getting ready")
         for k in range(40):
             update(k + 1, f"loss {k}")
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 11
+    assert lines[0] == "steps: 0/40, getting ready", "nothing is known of the time that is left"
     assert lines[-1].startswith("steps: 40/40, 0 s left")

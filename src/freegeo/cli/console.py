@@ -98,8 +98,9 @@ def _lines(title: str, total: int):
         tenth = done * 10 // total
         if tenth > shown:
             shown = tenth
-            left = (time.monotonic() - started) * (total - done) / max(done, 1)
-            note(f"{title}: {done}/{total}, {left:.0f} s left{', ' + text if text else ''}")
+            # What comes before the first unit, such as an adaptation, says nothing about the time of the units.
+            left = f", {(time.monotonic() - started) * (total - done) / done:.0f} s left" if done else ""
+            note(f"{title}: {done}/{total}{left}{', ' + text if text else ''}")
 
     return update
 
