@@ -17,14 +17,6 @@ IMAGES = noise(4)
 MODELS = {"da3": tiny_da3, "vggt": tiny_vggt}
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture(params=MODELS)
 def build(request):
     return MODELS[request.param]

@@ -25,18 +25,12 @@ BUILDERS = {
 }
 LAST, MIDDLE = -1, 2
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 @pytest.fixture(scope="module", params=BUILDERS)
 def model(request):
     return BUILDERS[request.param]()
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def images(views: int = 5, height: int = 28, width: int = 42, batch: int = 1) -> torch.Tensor:

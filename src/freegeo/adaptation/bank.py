@@ -43,11 +43,11 @@ def accesses(steps: Iterable[Sequence[Visit]], recipe: Recipe, *, teacher_once: 
         for visit in visits:
             key = set_key(visit.view_set, recipe)
             if not teacher_once or key not in known:
-                yield visit.view_set, tuple(range(len(visit.view_set.frames)))
+                yield visit.view_set, visit.view_set.positions
             known.add(key)
             yield visit.view_set, visit.view_set.kept
         for visit in visits if recipe.hold else ():
-            yield visit.view_set, tuple(range(len(visit.view_set.frames)))
+            yield visit.view_set, visit.view_set.positions
 
 
 @torch.no_grad()

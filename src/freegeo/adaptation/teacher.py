@@ -28,6 +28,8 @@ from freegeo.adaptation.losses import (
 )
 from freegeo.adaptation.recipe import Recipe
 from freegeo.adaptation.views import ViewSet, Visit
+from freegeo.models.api import ReconstructionModel
+from freegeo.types import ViewTokens
 
 Level = tuple[Tensor, Tensor]
 DRAW_SEED_STRIDE = 1_000_003
@@ -45,6 +47,11 @@ class Comparison:
     """How the all-pairs KL is computed; None: the loss measures it, which costs a host read."""
     views: int
     """Views that the teacher saw."""
+
+
+def loss_features(model: ReconstructionModel, tokens: ViewTokens) -> Mapping[int, Level]:
+    """Return what a loss compares: the features at the loss layers, the first view being the reference."""
+    return model.aggregate(tokens, layers=model.spec.loss_layers, reference="first").levels
 
 
 def step_draws(config: LossConfig, level: Level, view_set: ViewSet, *, seed: int, step: int) -> StepDraws:
@@ -143,10 +150,9 @@ class TeacherBank:
 
     @torch.no_grad()
     def _features(self, view_set: ViewSet) -> Mapping[int, Level]:
-        tokens = self.bank.tokens(view_set, range(len(view_set.frames)))
-        model = self.adapter.model
+        tokens = self.bank.tokens(view_set, view_set.positions)
         with self.adapter.off(), self.arithmetic():
-            return model.aggregate(tokens, layers=model.spec.loss_layers, reference="first").levels
+            return loss_features(self.adapter.model, tokens)
 
     def _once(self, visit: Visit) -> Comparison:
         levels = self._features(visit.view_set)

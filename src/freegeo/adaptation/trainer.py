@@ -21,7 +21,7 @@ from freegeo.adaptation.images import SceneImages
 from freegeo.adaptation.losses import adaptation_loss, feature_distance, require_finite
 from freegeo.adaptation.recipe import Recipe
 from freegeo.adaptation.state import read_state, run_identity, write_state
-from freegeo.adaptation.teacher import Comparison, TeacherBank, stacked
+from freegeo.adaptation.teacher import Comparison, TeacherBank, loss_features, stacked
 from freegeo.adaptation.views import Visit, schedule
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import autocast, cast_linears
@@ -235,22 +235,19 @@ class _Run:
         return self.bank.tokens(visit.view_set, visit.view_set.kept), comparison
 
     def _compare(self, tokens: ViewTokens, comparison: Comparison) -> tuple[Tensor, dict[str, Tensor]]:
-        model = self.adapter.model
         with self.arithmetic():
-            levels = dict(model.aggregate(tokens, layers=model.spec.loss_layers, reference="first").levels)
+            levels = loss_features(self.adapter.model, tokens)
         return adaptation_loss(
             levels, comparison.targets, comparison.draws, self.recipe.loss, precision=comparison.precision
         )
 
     def _hold(self, visit: Visit) -> tuple[Tensor, dict[str, Tensor]]:
         """Compare the adapted features of all views with the frozen ones: what needs no correction shall stay."""
-        tokens = self.bank.tokens(visit.view_set, range(len(visit.view_set.frames)))
-        model = self.adapter.model
-        aggregate = partial(model.aggregate, tokens, layers=model.spec.loss_layers, reference="first")
+        tokens = self.bank.tokens(visit.view_set, visit.view_set.positions)
         with self.arithmetic():
             with torch.no_grad(), self.adapter.off():
-                frozen = aggregate().levels
-            adapted = aggregate().levels
+                frozen = loss_features(self.adapter.model, tokens)
+            adapted = loss_features(self.adapter.model, tokens)
         loss = self.recipe.hold * feature_distance(adapted, frozen, self.recipe.loss)[0]
         return loss, {"hold": loss.detach(), "total": loss.detach()}
 

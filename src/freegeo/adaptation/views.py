@@ -25,6 +25,11 @@ class ViewSet:
     """Positions in `frames` that the student sees."""
     seed: int
 
+    @property
+    def positions(self) -> tuple[int, ...]:
+        """Positions in `frames` that the teacher sees: all of them."""
+        return tuple(range(len(self.frames)))
+
 
 def draw_frames(count: int, views: int, seed: int, *, repeat: bool, neighbours: bool = False) -> tuple[int, ...]:
     """Draw the frames of a view set from `count` frames (method's fact sheet, section 3.3), ascending.
