@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from freegeo.cli import console
-from freegeo.training.config import TrainConfig
 
 
 def train_tiny(
     output: Path,
     *,
-    views: int = TrainConfig.views,
+    views: int | None = None,
     minutes: float | None = None,
     workers: int = 1,
     device: str = "cpu",
@@ -24,7 +23,7 @@ def train_tiny(
     output
         Folder of the run: state, log, rendered rooms, weights.
     views
-        Views to learn from, counted with repetition.
+        Views to learn from, counted with repetition; default: those of the shipped recipe.
     minutes
         Stop this leg after so many minutes; the state is saved.
     workers
@@ -35,14 +34,15 @@ def train_tiny(
         Seed of weights, rooms and batches.
     """
     from freegeo.models.precision import choose_device
+    from freegeo.training.config import TrainConfig
     from freegeo.training.curve import plot_learning_curve
     from freegeo.training.loop import LOG, train
 
-    config = TrainConfig(views=views, seed=seed)
-    with console.progress_bar("views", views) as update:
+    config = TrainConfig(seed=seed) if views is None else TrainConfig(views=views, seed=seed)
+    with console.progress_bar("views", config.views) as update:
         weights = train(
             config, output, minutes=minutes, workers=workers, device=str(choose_device(device)),
-            progress=lambda state: update(min(state.seen, views)),
+            progress=lambda state: update(min(state.seen, config.views)),
         )  # fmt: skip
     console.say(f"weights: {weights} ({console.size(weights)})")
     log = output / LOG
