@@ -1,6 +1,7 @@
 """Generated rooms: exact geometry, determinism, sane cameras and light."""
 
 import math
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -26,10 +27,11 @@ from freegeo.errors import UserError
 from freegeo.geometry.camera import K_from_fov, resize_K
 from freegeo.geometry.depth import unproject
 from freegeo.geometry.reproject import compare_depth, reproject
+from freegeo.geometry.rotation import rotation_angle
 from freegeo.geometry.se3 import inverse, transform_points
 
 HW = (36, 48)
-SHIFTED = ("light", "lowtex", "tex", "big")
+SHIFTED = ("light", "lowtex", "tex", "big", "sparse")
 
 
 @cache
@@ -109,7 +111,19 @@ def test_poses_are_rigid_and_the_world_frame_is_nobody_s_camera():
     assert (rooms().T_cam_world[:, 0] - torch.eye(4)).abs().amax((-1, -2)).min() > 0.1
 
 
-@pytest.mark.parametrize("domain", ["train", "big"])
+def test_a_faster_pace_turns_and_moves_farther_through_the_same_rooms():
+    seeds = get_domain("sparse").seeds(24)
+    fast, slow = (sample_rooms(seeds, domain=replace(get_domain("sparse"), pace=pace)) for pace in (1.5, 1.0))
+    rotations = [batch.T_cam_world[..., :3, :3] for batch in (fast, slow)]
+    fast_turn, slow_turn = (rotation_angle(R[:, :-1], R[:, 1:]).mean(1) for R in rotations)
+    # Pitch and roll have their own jitter, which the pace leaves alone.
+    assert ((fast_turn / slow_turn - 1.5).abs() < 0.1).all()
+    walked = [camera_centres(batch).diff(dim=1).norm(dim=-1).mean(1)[~batch.is_arc] for batch in (fast, slow)]
+    assert (walked[0] > 1.3 * walked[1]).all()
+    assert torch.equal(fast.texture, slow.texture) and torch.equal(fast.T_cam_room[:, 0], slow.T_cam_room[:, 0])
+
+
+@pytest.mark.parametrize("domain", ["train", "big", "sparse"])
 def test_cameras_stand_inside_off_the_walls_and_clear_of_everything(domain):
     batch = rooms(domain, 24, 16)
     centres = camera_centres(batch)

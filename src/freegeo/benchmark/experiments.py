@@ -12,7 +12,7 @@ from freegeo.benchmark.variants import VARIANTS
 from freegeo.data.procedural.splits import FRAMES, PREFIX
 from freegeo.errors import UserError
 
-ROOMS = tuple(f"{PREFIX}{name}" for name in ("test-id", "light", "lowtex", "tex", "big"))
+ROOMS = tuple(f"{PREFIX}{name}" for name in ("test-id", "light", "lowtex", "tex", "big", "sparse"))
 """The splits of the generated rooms that are reported."""
 Layout = Literal["means", "changes", "costs", "gain"]
 

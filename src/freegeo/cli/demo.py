@@ -47,7 +47,8 @@ def demo(
     room
         Number of the room.
     domain
-        Kind of room: test-id (like training), light (dark, colour cast, noise), lowtex, tex, big.
+        Kind of room: test-id (like training), light (dark, colour cast, noise), lowtex, tex, big,
+        sparse (photos far apart).
     """
     scene = demo_scene(room, domain)
     loaded = model.load()

@@ -32,7 +32,7 @@ ASPECT = (3, 4)
 GAP_METRICS = ("auc30", "auc15", "auc05", "f1", "abs_rel", "rotation_deg", "translation_deg")
 PREMISE_METRICS = ("auc30", "auc15", "f1")
 """Metrics whose 8->4 minus 4 interval has to leave out zero on the good side."""
-DOMAIN_ROOMS = dict.fromkeys(("test-id", "light", "lowtex", "tex", "big", "lens"), 200)
+DOMAIN_ROOMS = dict.fromkeys(("test-id", "light", "lowtex", "tex", "big", "sparse", "lens"), 200)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,13 +27,16 @@ FRAME_NUMBERS = 8
 """Uniform numbers of one frame."""
 
 
-def camera_poses(half_extent_m: Tensor, trajectory: Tensor, jitter: Tensor) -> tuple[Tensor, Tensor]:
+def camera_poses(
+    half_extent_m: Tensor, trajectory: Tensor, jitter: Tensor, *, pace: float = 1.0
+) -> tuple[Tensor, Tensor]:
     """Poses of S views in each of B rooms.
 
     Args:
         half_extent_m: (B, 3) half width, half depth and full height of the room.
         trajectory: (B, `TRAJECTORY_NUMBERS`) uniform numbers.
         jitter: (B, S, `FRAME_NUMBERS`) uniform numbers.
+        pace: factor on turns and steps from one view to the next.
 
     Returns:
         `T_cam_room` (B, S, 4, 4), OpenCV axes, and `is_arc` (B,) bool.
@@ -41,12 +44,12 @@ def camera_poses(half_extent_m: Tensor, trajectory: Tensor, jitter: Tensor) -> t
     is_arc = trajectory[:, 0] < ARC_SHARE
     direction = torch.where(trajectory[:, 1] < 0.5, -1.0, 1.0)
     step = _between(trajectory[:, 2], *(math.radians(angle) for angle in STEP_DEG))
-    turns = step[:, None] * _between(jitter[..., 0], 0.95, 1.05)
+    turns = pace * step[:, None] * _between(jitter[..., 0], 0.95, 1.05)
     turns = (direction[:, None] * turns).cumsum(1) - direction[:, None] * turns[:, :1]
     inner = half_extent_m[:, :2] - WALL_MARGIN_M
 
     arc_position, arc_yaw, arc_pitch = _arc(inner, turns, trajectory)
-    walk_position, walk_yaw, walk_pitch = _walk(inner, turns, direction * step, trajectory, jitter)
+    walk_position, walk_yaw, walk_pitch = _walk(inner, turns, direction * step, trajectory, jitter, pace)
     position = torch.where(is_arc[:, None, None], arc_position, walk_position)
     yaw = torch.where(is_arc[:, None], arc_yaw, walk_yaw) + _around(jitter[..., 1], math.radians(0.8))
     pitch = torch.where(is_arc[:, None], arc_pitch, walk_pitch) + _around(jitter[..., 2], math.radians(2.0))
@@ -87,19 +90,19 @@ def _arc(inner: Tensor, turns: Tensor, trajectory: Tensor) -> tuple[Tensor, Tens
 
 
 def _walk(
-    inner: Tensor, turns: Tensor, signed_step: Tensor, trajectory: Tensor, jitter: Tensor
+    inner: Tensor, turns: Tensor, signed_step: Tensor, trajectory: Tensor, jitter: Tensor, pace: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """A walk along an ellipse while the gaze, outwards at first, pans at its own rate."""
     frames = turns.shape[1]
     axes = inner * _between(trajectory[:, 3:4], *WALK_RADIUS)
-    pace = signed_step.abs() * axes.mean(1) * _between(trajectory[:, 4], 0.85, 1.3)
-    pace = pace.clamp(*WALK_STEP_M) * signed_step.sign()
+    stride = signed_step.abs() * axes.mean(1) * _between(trajectory[:, 4], 0.85, 1.3)
+    stride = pace * stride.clamp(*WALK_STEP_M) * signed_step.sign()
     angle = 2.0 * math.pi * trajectory[:, 5]
     angles = [angle]
     for frame in range(1, frames):
         # Half a step ahead the ellipse's speed stands for the whole step.
-        middle = angle + 0.5 * pace / _ellipse_speed(axes, angle)
-        angle = angle + pace * _between(jitter[:, frame, 7], 0.95, 1.05) / _ellipse_speed(axes, middle)
+        middle = angle + 0.5 * stride / _ellipse_speed(axes, angle)
+        angle = angle + stride * _between(jitter[:, frame, 7], 0.95, 1.05) / _ellipse_speed(axes, middle)
         angles.append(angle)
     path = torch.stack(angles, dim=1)
     height = _heights(trajectory, torch.linspace(0.0, 1.0, frames, device=turns.device))

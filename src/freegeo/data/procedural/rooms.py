@@ -114,7 +114,7 @@ def sample_rooms(
     half_extent, placed = _contents(seeds, domain)
     trajectory = _uniform(seeds, 1, TRAJECTORY_NUMBERS + 5)
     jitter = _uniform(seeds, 2, frames * FRAME_NUMBERS).view(len(seeds), frames, FRAME_NUMBERS)
-    T_cam_room, is_arc = camera_poses(half_extent, trajectory[:, :TRAJECTORY_NUMBERS], jitter)
+    T_cam_room, is_arc = camera_poses(half_extent, trajectory[:, :TRAJECTORY_NUMBERS], jitter, pace=domain.pace)
     center, yaw, size = _placement(half_extent, placed, is_arc)
     camera = -(T_cam_room[..., :3, :3].mT @ T_cam_room[..., :3, 3:])[..., 0]
     near = (_distance(camera, center, yaw, size) < CLEARANCE_M).any(dim=1)

@@ -191,5 +191,6 @@ BANKS: dict[str, tuple[int, tuple[Callable[[np.random.Generator], Array], ...]]]
     "lowtex": (103, _FIVE),
     "tex": (104, (_bricks, _rings)),
     "big": (105, _FIVE),
+    "sparse": (106, _FIVE),
 }
 """Seed and patterns of every bank; pattern `k % len(patterns)` makes texture k."""
