@@ -84,22 +84,32 @@ def progress_bar(title: str, total: int) -> Generator[Any]:
         TimeRemainingColumn(), TextColumn("{task.fields[text]}"),
     )  # fmt: skip
     with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(title, total=total, text="")
-        yield lambda done, text="": bar.update(task, completed=done, text=text)
+        task, known = bar.add_task(title, total=total, text=""), False
+
+        def update(done: int, text: str = "") -> None:
+            nonlocal known
+            if not known:  # a resumed run begins far from zero, which must not look like speed
+                known = True
+                bar.reset(task, completed=done, text=text)
+            bar.update(task, completed=done, text=text)
+
+        yield update
 
 
 def _lines(title: str, total: int):
     import time
 
-    started, shown = time.monotonic(), -1
+    first, shown = None, -1
 
     def update(done: int, text: str = "") -> None:
-        nonlocal shown
+        nonlocal first, shown
+        # What comes before the first report, such as an adaptation or an earlier leg, says nothing about the speed.
+        first = first or (done, time.monotonic())
         tenth = done * 10 // total
         if tenth > shown:
             shown = tenth
-            # What comes before the first unit, such as an adaptation, says nothing about the time of the units.
-            left = f", {(time.monotonic() - started) * (total - done) / done:.0f} s left" if done else ""
+            gained, seconds = done - first[0], time.monotonic() - first[1]
+            left = f", {seconds * (total - done) / gained:.0f} s left" if gained else ""
             note(f"{title}: {done}/{total}{left}{', ' + text if text else ''}")
 
     return update
