@@ -71,6 +71,40 @@ def test_a_larger_budget_goes_on_from_the_plateau(tmp_path, small_config, whole_
     assert steps[-1][1] >= 60
 
 
+def test_a_run_continues_another_one_with_rooms_and_rates_of_its_own(tmp_path, small_config, whole_run):
+    before = torch.load(whole_run.parent / state.STATE, weights_only=True)["counters"].tolist()
+    config = replace(small_config, views=60, first_room=6, peak=0.25, cooldown=1.0)
+    steps = []
+    folder = tmp_path / "next"
+    train(config, folder, continue_from=whole_run.parent, progress=lambda now: steps.append((now.step, now.seen)))
+    assert steps[0][0] == before[0] + 1 and before[1] < steps[0][1] <= before[1] + 4 and steps[-1][1] >= 60
+    begun = replace(config, begin=(int(before[0]), int(before[1])))
+    assert read_json(folder / loop.CONFIG)["begin"] == list(begun.begin)
+    assert begun.rate(begun.begin[1]) == 0.0 and begun.rate(60) == 0.0
+    assert 0 < max(begun.rate(seen) for seen in range(begun.begin[1], 60)) <= 0.25
+    first_shards = [tensors(run / "rooms" / "rooms-64-00000.safetensors") for run in (folder, whole_run.parent)]
+    assert not torch.equal(first_shards[0]["images"], first_shards[1]["images"])
+    # Without being told again, and wherever the other run is by now.
+    resumed = []
+    train(replace(config, views=64), folder, progress=lambda now: resumed.append(now.seen))
+    assert 60 < resumed[0] <= 64 + 4
+
+
+def test_mistakes_about_the_run_to_continue_are_named(tmp_path, small_config, whole_run):
+    with pytest.raises(UserError, match="no run to continue"):
+        train(small_config, tmp_path / "next", continue_from=tmp_path)
+    with pytest.raises(UserError, match="continues no other"):
+        train(small_config, whole_run.parent, continue_from=tmp_path)
+    with pytest.raises(UserError, match="Ask for more"):
+        train(replace(small_config, views=30), tmp_path / "next", continue_from=whole_run.parent)
+
+
+@pytest.mark.parametrize("name, value", [("peak", 0.0), ("cooldown", 1.5), ("rooms", 0), ("first_room", -1)])
+def test_settings_out_of_range_are_refused(small_config, name, value):
+    with pytest.raises(UserError, match=f"cannot train with {name.replace('_', '-')} {value}"):
+        replace(small_config, **{name: value})
+
+
 def test_other_settings_need_another_folder(small_config, whole_run):
     with pytest.raises(UserError, match="another seed"):
         train(replace(small_config, seed=7), whole_run.parent)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from freegeo.cli import console
 
@@ -15,6 +16,11 @@ def train_tiny(
     workers: int = 1,
     device: str = "cpu",
     seed: int = 0,
+    continue_from: Path | None = None,
+    peak: float | None = None,
+    cooldown: float | None = None,
+    rooms: int | None = None,
+    first_room: int | None = None,
 ) -> None:
     """Train the embedded model; the same command continues, a larger --views goes on from the plateau.
 
@@ -31,18 +37,35 @@ def train_tiny(
     device
         cpu or cuda, for rendering and training.
     seed
-        Seed of weights, rooms and batches.
+        Seed of weights and batches.
+    continue_from
+        Folder of another run; this one starts where that one stands, with these settings and rooms.
+    peak
+        Factor on all learning rates; about 0.2 for a run that continues a finished one.
+    cooldown
+        Share of the run's views in which the learning rate falls to zero.
+    rooms
+        Rooms to learn from.
+    first_room
+        First room of the training domain; a number beyond an earlier run's gives rooms that it has not seen.
     """
     from freegeo.models.precision import choose_device
     from freegeo.training.config import TrainConfig
     from freegeo.training.curve import plot_learning_curve
     from freegeo.training.loop import LOG, train
 
-    config = TrainConfig(seed=seed) if views is None else TrainConfig(views=views, seed=seed)
+    given: dict[str, Any] = {
+        "views": views,
+        "peak": peak,
+        "cooldown": cooldown,
+        "rooms": rooms,
+        "first_room": first_room,
+    }
+    config = TrainConfig(seed=seed, **{name: value for name, value in given.items() if value is not None})
     with console.progress_bar("views", config.views) as update:
         weights = train(
             config, output, minutes=minutes, workers=workers, device=str(choose_device(device)),
-            progress=lambda state: update(min(state.seen, config.views)),
+            continue_from=continue_from, progress=lambda state: update(min(state.seen, config.views)),
         )  # fmt: skip
     console.say(f"weights: {weights} ({console.size(weights)})")
     log = output / LOG

@@ -4,6 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from freegeo.errors import UserError
+
+_RANGES = {
+    "views": "Give a positive number.",
+    "peak": "Give a positive number, at most about 1.",
+    "cooldown": "Give a share between 0 and 1.",
+    "rooms": "Give a positive number.",
+    "first_room": "Give 0 or more.",
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class LossWeights:
@@ -13,7 +23,7 @@ class LossWeights:
     cell_depth: float = 2.0
     gradient: float = 0.5
     rotation: float = 4.0
-    translation: float = 2.5
+    translation: float = 3.5
     absolute: float = 0.5
     field_of_view: float = 1.0
     rays: float = 2.0
@@ -41,12 +51,18 @@ class TrainConfig:
 
     views: int = 700_000
     """Views the model learns from, counted with repetition; the last `cooldown` of them lower the learning rate."""
+    begin: tuple[int, int] = (0, 0)
+    """Steps and views of the run that this one continues; (0, 0): a start from nothing."""
+    peak: float = 1.0
+    """Factor on all learning rates; a run that continues a cooled one wants about 0.2."""
     seed: int = 0
     side: int = 64
     """Longest image side in pixels."""
     views_per_step: int = 48
     rooms: int = 7_680
     """Rooms in the pool; they are rendered a shard at a time while training goes on."""
+    first_room: int = 0
+    """Rooms of the training domain to leave out, because an earlier run has learned from them."""
     frames: int = 16
     matrix_lr: float = 4e-3
     """Muon, for the matrices of the blocks and the camera decoder."""
@@ -71,6 +87,18 @@ class TrainConfig:
     """Steps between two updates of the ray branch, which learns on detached features."""
     weights: LossWeights = LossWeights()
 
+    def __post_init__(self):
+        checks = {
+            "views": self.views > 0,
+            "peak": self.peak > 0,
+            "cooldown": 0 <= self.cooldown <= 1,
+            "rooms": self.rooms > 0,
+            "first_room": self.first_room >= 0,
+        }
+        for name, good in checks.items():
+            if not good:
+                raise UserError(f"cannot train with {name.replace('_', '-')} {getattr(self, name)}. {_RANGES[name]}")
+
     def stage(self, seen: int) -> Stage:
         """Return what is learned from after `seen` views: short windows come first, and small images."""
         side = self.side * 3 // 4 if seen < self.small_until else self.side
@@ -82,11 +110,12 @@ class TrainConfig:
 
     def rate(self, seen: int) -> float:
         """Return the factor on all learning rates: warm-up, plateau, quadratic cool-down to zero."""
-        warm = min(1.0, seen / self.warmup_views)
+        warm = min(1.0, (seen - self.begin[1]) / self.warmup_views)
         start = self.cooldown_start
-        return warm if seen < start else max(0.0, (self.views - seen) / (self.views - start)) ** 2
+        left = 1.0 if seen < start else max(0.0, (self.views - seen) / (self.views - start))
+        return self.peak * warm * left**2
 
     @property
     def cooldown_start(self) -> float:
         """Views after which the learning rate falls."""
-        return self.views * (1 - self.cooldown)
+        return self.begin[1] + (self.views - self.begin[1]) * (1 - self.cooldown)

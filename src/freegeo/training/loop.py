@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 import time
 from collections.abc import Callable
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,13 @@ from torch import nn
 
 from freegeo import __version__
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.storage import locked, read_json, write_json, write_tensors
+from freegeo.storage import atomic_path, locked, read_json, write_json, write_tensors
 from freegeo.training.batches import Batch, draw_batch
 from freegeo.training.config import TrainConfig
 from freegeo.training.evaluate import evaluate
 from freegeo.training.objective import objective, zero_motion_rotation
 from freegeo.training.pool import ASPECTS, Pool
-from freegeo.training.state import PLATEAU, PLATEAU_LR, STATE, State, averaged, new_state, resume, save
+from freegeo.training.state import PLATEAU, PLATEAU_LR, START, STATE, State, averaged, new_state, resume, save
 from freegeo.training.workers import Crew
 
 logger = logging.getLogger(__name__)
@@ -43,18 +44,22 @@ def train(
     minutes: float | None = None,
     workers: int = 1,
     device: str = "cpu",
+    continue_from: Path | None = None,
     progress: Callable[[State], None] = lambda state: None,
 ) -> Path:
     """Train until the view budget or the time limit of this leg is used up; return the weight file.
 
     The same call continues a stopped run: with one worker it ends with the same tensors as a run that was never
     stopped. A larger `views` continues from the plateau before the cool-down. `workers` processes of one thread each
-    change the shared weights without locks; on another device than the CPU there is one. UserError when the folder
-    holds a run with other settings; FreeGeoError when a loss is not finite or a worker dies.
+    change the shared weights without locks; on another device than the CPU there is one. `continue_from`, the folder of
+    another run, makes this one start where that one stands, with its own settings and rooms. UserError when the folder
+    holds a run with other settings or `continue_from` holds none; FreeGeoError when a loss is not finite or a worker
+    dies.
     """
     if workers < 1 or (workers > 1 and device != "cpu"):
         raise UserError(f"cannot train with {workers} workers on {device}. Use one, or several on the cpu.")
     with locked(folder), one_thread(device):
+        config = begin(config, folder, continue_from)
         require_same_settings(config, folder)
         state = new_state(config, device)
         resume(state, config, folder)
@@ -99,7 +104,7 @@ class Trainer:
         with self.lock:
             index, seen = state.step, state.seen
             state.counters[0] += 1
-        fill(self.pool, index, render_new=render_new)
+        fill(self.pool, index - config.begin[0], render_new=render_new)
         generator = torch.Generator().manual_seed(config.seed * 1_000_003 + index)
         batch = draw_batch(self.pool, config, seen, generator, self.device)
         terms = objective(state.model, state.read_outs, batch, config, index, generator)
@@ -158,23 +163,42 @@ def apply_gradients(state: State, config: TrainConfig) -> None:
 
 def require_same_settings(config: TrainConfig, folder: Path) -> None:
     """Store the settings, or refuse to go on with other ones; only the view budget may change."""
-    settings = json.loads(json.dumps(asdict(config)))
+    settings, defaults = (json.loads(json.dumps(asdict(each))) for each in (config, TrainConfig()))
     path = folder / CONFIG
     if path.is_file():
-        before = read_json(path)
-        different = [name for name in settings if name != "views" and before.get(name) != settings[name]]
+        before = defaults | read_json(path)  # a run may be older than a setting
+        different = [name for name in settings if name != "views" and before[name] != settings[name]]
         if different:
             raise UserError(f"{folder}: holds a training run with another {', '.join(different)}. Choose a new folder.")
     write_json(path, settings)
 
 
+def begin(config: TrainConfig, folder: Path, continue_from: Path | None) -> TrainConfig:
+    """Copy the state of the run to continue, once, and return the settings with where that run stood."""
+    start = folder / START
+    if continue_from is not None and not start.is_file():
+        if (folder / CONFIG).is_file():
+            raise UserError(f"{folder}: holds a run that continues no other. Choose a new folder.")
+        source = continue_from / STATE
+        if not source.is_file():
+            raise UserError(f"{source}: not found, so there is no run to continue. Name the folder of a training run.")
+        with atomic_path(start) as part:
+            shutil.copyfile(source, part)
+    if not start.is_file():
+        return config
+    steps, views, _ = torch.load(start, weights_only=True, map_location="cpu")["counters"].tolist()
+    if config.views <= views:
+        raise UserError(f"{folder}: the run to continue has seen {views:.0f} views. Ask for more than that.")
+    return replace(config, begin=(int(steps), int(views)))
+
+
 def shards_at(step: int) -> int:
-    """Return how many shards of rooms a step draws from: one of each aspect at first, then more and more."""
+    """Return how many shards of rooms a run's step draws from: one of each aspect at first, then more and more."""
     return len(ASPECTS) + -(-step // GROW_EVERY_STEPS)
 
 
 def fill(pool: Pool, step: int, *, render_new: bool) -> None:
-    """Load what a step draws from, rendering what is missing when asked to."""
+    """Load what a run's step draws from, rendering what is missing when asked to."""
     while len(pool.shards) < shards_at(step) and pool.grow(render_new=render_new):
         pass
 
@@ -183,9 +207,10 @@ def open_pool(config: TrainConfig, state: State, folder: Path, device: str) -> P
     """Open the run's rooms with as many as the next step draws from, so that other processes find them."""
     patch = state.model.config.patch_size
     pool = Pool(
-        folder / "rooms", rooms=config.rooms, frames=config.frames, side=config.side, patch=patch, device=device
-    )
-    fill(pool, state.step, render_new=True)
+        folder / "rooms", rooms=config.rooms, frames=config.frames, side=config.side, patch=patch,
+        first_room=config.first_room, device=device,
+    )  # fmt: skip
+    fill(pool, state.step - config.begin[0], render_new=True)
     return pool
 
 

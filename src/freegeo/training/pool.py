@@ -57,8 +57,11 @@ def render_rooms(seeds, domain: str, frames: int, size: tuple[int, int], *, devi
 class Pool:
     """The training rooms of a run; `grow` adds a shard until all rooms are there."""
 
-    def __init__(self, folder: Path, *, rooms: int, frames: int, side: int, patch: int, device: str = "cpu"):
+    def __init__(
+        self, folder: Path, *, rooms: int, frames: int, side: int, patch: int, first_room: int = 0, device: str = "cpu"
+    ):
         self.folder, self.frames, self.side, self.patch, self.device = folder, frames, side, patch, device
+        self.first_room = first_room
         self.total_shards = max(len(ASPECTS), -(-rooms // ROOMS_PER_SHARD))
         self.shards: list[Rooms] = []
 
@@ -81,7 +84,7 @@ class Pool:
         return True
 
     def _render(self, index: int, path: Path) -> None:
-        seeds = get_domain("train").seeds(ROOMS_PER_SHARD, start=index * ROOMS_PER_SHARD)
+        seeds = get_domain("train").seeds(ROOMS_PER_SHARD, start=self.first_room + index * ROOMS_PER_SHARD)
         size = image_size(self.side, ASPECTS[index % len(ASPECTS)], self.patch)
         write_tensors(path, vars(render_rooms(seeds, "train", self.frames, size, device=self.device)))
 

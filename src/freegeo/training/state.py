@@ -21,7 +21,8 @@ from freegeo.training.objective import ReadOuts
 
 logger = logging.getLogger(__name__)
 
-STATE, PLATEAU = "state.pt", "plateau.pt"
+STATE, PLATEAU, START = "state.pt", "plateau.pt", "start.pt"
+"""Newest state; state before the cool-down; state of the run that this one continues."""
 FIRST_FOV_RAD = 1.0
 MUON_PARTS = ("backbone.pretrained.blocks.", "cam_dec.backbone.")
 PLATEAU_LR = "plateau_lr"
@@ -168,7 +169,7 @@ def averaged(state: State) -> DA3:
 
 def resume(state: State, config: TrainConfig, folder: Path) -> None:
     """Continue from the newest state that fits the view budget."""
-    for name in (STATE, PLATEAU):
+    for name in (STATE, PLATEAU, START):
         path = folder / name
         if not path.is_file():
             continue
