@@ -46,7 +46,7 @@ from freegeo.models.api import ReconstructionModel
 from freegeo.models.catalog import load_model
 from freegeo.models.precision import Precision, autocast, choose_device, choose_precision
 from freegeo.storage import write_json
-from freegeo.types import Cameras, Features, Prediction, ViewTokens
+from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
 
 AdaptPer = Literal["dataset", "scene"]
 
@@ -174,11 +174,11 @@ class Predictor:
         if kind.encode_all:
             sample = choose_frames(task.rule, len(scene), SAMPLE, task.seed)
             kept = list(range(len(sample)))[::2][: task.views]
-            features = self._features(self._tokens(scene, sample), self._cameras(scene, sample)).select(kept)
+            features = self._features(*self._read(scene, sample)).select(kept)
             frames = [sample[position] for position in kept]
         else:
             frames = choose_frames(task.rule, len(scene), task.views, task.seed)
-            features = self._features(self._tokens(scene, frames), self._cameras(scene, frames))
+            features = self._features(*self._read(scene, frames))
         with self._arithmetic():
             found = self.model.decode(features)
         return frames, found.map(lambda tensor: tensor[0].float().cpu())
@@ -191,7 +191,7 @@ class Predictor:
         sample = choose_frames(task.rule, len(scene), SAMPLE, task.seed)
         kept = list(range(len(sample)))[::2][: task.views]
         layer = self.model.spec.loss_layers[-1]
-        tokens = self._tokens(scene, sample)
+        tokens, _ = self._read(scene, sample)
         with self._in_place[1].off() if self._in_place else nullcontext():
             teacher = self._features(tokens).select(kept).levels[layer][0].float()
         student = self._features(tokens.select(kept)).levels[layer][0].float()
@@ -199,20 +199,19 @@ class Predictor:
         values = {"mse": float((student - teacher).square().mean()), "cosine": float(cosine)}
         return [sample[position] for position in kept], values
 
-    def _tokens(self, scene: Scene, frames: Sequence[int]) -> ViewTokens:
-        images = self.model.preprocess([scene.photos[frame] for frame in frames]).images
+    def _read(self, scene: Scene, frames: Sequence[int]) -> tuple[ViewTokens, Cameras | None]:
+        """The embedded frames, and their true cameras as the model takes them when the run gives them away."""
+        chosen = scene.select(frames)
+        batch = self.model.preprocess(list(chosen.photos))
         with self._arithmetic():
-            return embed_in_chunks(self.model, images, device=self.engine.device)
+            tokens = embed_in_chunks(self.model, batch.images, device=self.engine.device)
+        if not self.setup.given_cameras:
+            return tokens, None
+        return tokens, true_cameras(chosen, batch).to(self.engine.device)
 
     def _features(self, tokens: ViewTokens, cameras: Cameras | None = None) -> Features:
         with self._arithmetic():
             return self.model.aggregate(tokens, reference="first", cameras=cameras)
-
-    def _cameras(self, scene: Scene, frames: Sequence[int]) -> Cameras | None:
-        """The true cameras of frames as the model takes them, when the run gives them away."""
-        if not self.setup.given_cameras:
-            return None
-        return true_cameras(scene.select(frames), self.model).to(self.engine.device)
 
     def _arithmetic(self):
         return autocast(self.engine.device, self.engine.precision)
@@ -282,10 +281,9 @@ def problem_of(stage: Literal["predict", "evaluate"]) -> Callable[[Task, BaseExc
     return explain
 
 
-def true_cameras(scene: Scene, model: ReconstructionModel) -> Cameras:
-    """True cameras (1, S) of a scene, poses normalised, K in pixels of the model's images; UserError without truth."""
+def true_cameras(scene: Scene, batch: ImageBatch) -> Cameras:
+    """True cameras (1, S) of a scene, poses normalised, K in pixels of its `batch`; UserError without truth."""
     truth, T_cam_world, K = require_truth(scene)
-    batch = model.preprocess(list(scene.photos))
     sizes = zip(K, truth.camera_hw, scene.photos, strict=True)
     photo_K = torch.stack([resize_K(one, camera_hw, photo.size_hw) for one, camera_hw, photo in sizes])
     return Cameras(T_cam_world=se3.normalise_poses(T_cam_world)[None], K=batch.model_K(photo_K)[None])
