@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from freegeo.geometry import se3
-from freegeo.training.config import TrainConfig
+from freegeo.training.config import Stage, TrainConfig
 from freegeo.training.pool import Pool, Rooms
 
 
@@ -32,9 +32,11 @@ class Batch:
         return self.images.shape[0] * self.images.shape[1]
 
 
-def window(frames: int, views: int, max_stride: int, generator: torch.Generator) -> list[int]:
+def window(frames: int, views: int, stage: Stage, generator: torch.Generator) -> list[int]:
     """Draw `views` frame numbers with a random stride, in walking order or reversed."""
-    stride = int(torch.randint(1, min(max_stride, (frames - 1) // max(views - 1, 1)) + 1, (), generator=generator))
+    steps = max(views - 1, 1)
+    most = min(stage.max_stride, max(1, stage.reach // steps), (frames - 1) // steps)
+    stride = int(torch.randint(1, most + 1, (), generator=generator))
     start = int(torch.randint(frames - stride * (views - 1), (), generator=generator))
     picked = list(range(start, start + stride * views, stride))
     return picked[::-1] if torch.rand((), generator=generator) < 0.5 else picked
@@ -47,9 +49,7 @@ def draw_batch(
     stage = config.stage(seen)
     views = stage.views[int(torch.randint(len(stage.views), (), generator=generator))]
     picks = pool.draw(max(1, config.views_per_step // views), generator)
-    parts = [
-        (rooms, room, torch.tensor(window(rooms.frames, views, stage.max_stride, generator))) for rooms, room in picks
-    ]
+    parts = [(rooms, room, torch.tensor(window(rooms.frames, views, stage, generator))) for rooms, room in picks]
     gathered = Rooms(
         **{
             name: torch.stack([getattr(rooms, name)[room, frames] for rooms, room, frames in parts]).to(device)

@@ -41,6 +41,8 @@ class Stage:
     """Possible numbers of views in a sample."""
     max_stride: int
     """Largest distance between neighbouring views, in frames."""
+    reach: int
+    """Largest distance between the first and the last view, in frames; more views than that still follow each other."""
     side: int
     """Longest image side in pixels."""
 
@@ -81,6 +83,8 @@ class TrainConfig:
     """Views before windows reach 16 views and stride 3."""
     small_until: int = 270_000
     """Views before the images reach their full size; at three quarters of it a view costs 40 % less."""
+    reach: int = 10
+    """Largest distance between the first and the last view of a sample, in frames, where its views are spread."""
     depth_views: int = 8
     """Views that the dense head learns from in one step, at most one of each sample."""
     ray_branch_every: int = 8
@@ -103,10 +107,10 @@ class TrainConfig:
         """Return what is learned from after `seen` views: short windows come first, and small images."""
         side = self.side * 3 // 4 if seen < self.small_until else self.side
         if seen < self.pairs_until:
-            return Stage(views=(2, 3), max_stride=1, side=side)
+            return Stage(views=(2, 3), max_stride=1, reach=self.reach, side=side)
         if seen < self.short_until:
-            return Stage(views=(2, 3, 4), max_stride=2, side=side)
-        return Stage(views=(2, 4, 4, 4, 6, 8, 8, 8, 12, 16), max_stride=3, side=side)
+            return Stage(views=(2, 3, 4), max_stride=2, reach=self.reach, side=side)
+        return Stage(views=(2, 4, 4, 4, 6, 8, 8, 8, 12, 16), max_stride=3, reach=self.reach, side=side)
 
     def rate(self, seen: int) -> float:
         """Return the factor on all learning rates: warm-up, plateau, quadratic cool-down to zero."""
