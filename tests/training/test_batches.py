@@ -8,7 +8,6 @@ from freegeo.training.batches import augment, shrink, to_batch, window
 from freegeo.training.config import Stage, TrainConfig
 from freegeo.training.objective import cell_targets, partners
 
-
 STAGE = Stage(views=(4,), max_stride=3, reach=10, side=64)
 
 
