@@ -6,13 +6,8 @@ from dataclasses import dataclass
 
 from freegeo.errors import UserError
 
-_RANGES = {
-    "views": "Give a positive number.",
-    "peak": "Give a positive number, at most about 1.",
-    "cooldown": "Give a share between 0 and 1.",
-    "rooms": "Give a positive number.",
-    "first_room": "Give 0 or more.",
-}
+_SMALLEST = {"views": 1, "peak": 1e-6, "cooldown": 0.0, "rooms": 1, "first_room": 0}
+_LARGEST = {"peak": 1.0, "cooldown": 1.0}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,16 +87,11 @@ class TrainConfig:
     weights: LossWeights = LossWeights()
 
     def __post_init__(self):
-        checks = {
-            "views": self.views > 0,
-            "peak": self.peak > 0,
-            "cooldown": 0 <= self.cooldown <= 1,
-            "rooms": self.rooms > 0,
-            "first_room": self.first_room >= 0,
-        }
-        for name, good in checks.items():
-            if not good:
-                raise UserError(f"cannot train with {name.replace('_', '-')} {getattr(self, name)}. {_RANGES[name]}")
+        for name, smallest in _SMALLEST.items():
+            value, largest = getattr(self, name), _LARGEST.get(name)
+            if value < smallest or (largest is not None and value > largest):
+                limits = f"at least {smallest:g}" + (f" and at most {largest:g}" if largest is not None else "")
+                raise UserError(f"cannot train with {name.replace('_', '-')} {value}. Give {limits}.")
 
     def stage(self, seen: int) -> Stage:
         """Return what is learned from after `seen` views: short windows come first, and small images."""
