@@ -47,8 +47,9 @@ def test_given_cameras_change_the_prediction_and_are_scored_with(setup):
 def test_true_cameras_belong_to_the_models_images(setup):
     scene = load_scene(setup.data, DATASET, ROOMS[0])
     predictor = Predictor(setup)
-    cameras = true_cameras(scene, predictor.model.preprocess(list(scene.photos)))
-    width = predictor.model.preprocess(list(scene.photos)).image_hw[1]
+    batch = predictor.model.preprocess(list(scene.photos))
+    cameras = true_cameras(scene, batch)
+    width = batch.image_hw[1]
     torch.testing.assert_close(cameras.K[0, :, 0, 2] / width, scene.K[:, 0, 2] / 64, atol=1e-3, rtol=0)
     torch.testing.assert_close(cameras.K[0, :, 0, 0] / width, scene.K[:, 0, 0] / 64, atol=1e-3, rtol=0)
     torch.testing.assert_close(cameras.T_cam_world[0, 0], torch.eye(4), atol=1e-5, rtol=0)

@@ -186,7 +186,7 @@ def begin(config: TrainConfig, folder: Path, continue_from: Path | None) -> Trai
             shutil.copyfile(source, part)
     if not start.is_file():
         return config
-    steps, views, _ = torch.load(start, weights_only=True, map_location="cpu")["counters"].tolist()
+    steps, views, _ = torch.load(start, weights_only=True, map_location="cpu", mmap=True)["counters"].tolist()
     if config.views <= views:
         raise UserError(f"{folder}: the run to continue has seen {views:.0f} views. Ask for more than that.")
     return replace(config, begin=(int(steps), int(views)))
