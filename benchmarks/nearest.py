@@ -1,6 +1,6 @@
 """Nearest-neighbour distances between two room-sized clouds: plain cKDTree on unordered points against ours.
 
-Ours (`freegeo.benchmark.cloud`) sorts both clouds along a Z-curve, as voxel averaging leaves them, and builds the tree
+Ours (`freegeo.metrics.cloud`) sorts both clouds along a Z-curve, as voxel averaging leaves them, and builds the tree
 without compact nodes. "near" compares two noisy samples of one room, "far" a room with a third of it (most of its
 points lie far from the other cloud, as in scores of few views). The distances must be equal.
 
@@ -15,7 +15,7 @@ import numpy as np
 from record import write_result
 from scipy.spatial import cKDTree
 
-from freegeo.benchmark.cloud import morton_order, nearest_distances
+from freegeo.metrics.cloud import morton_order, nearest_distances
 
 ROOM = np.array([6.0, 3.0, 5.0])
 

@@ -4,7 +4,7 @@ from functools import cache
 
 from freegeo.benchmark.stored import write_stored
 from freegeo.benchmark.tasks import Task, choose_frames, finish
-from freegeo.data.datasets import load_scene
+from freegeo.data.datasets.registry import load_scene
 from freegeo.data.procedural import render, sample_rooms
 from freegeo.data.procedural.photographs import RenderedPhoto
 from freegeo.data.scene import Scene

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from exact_rooms import room
-from freegeo import storage
+from freegeo import files
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.geometry.rotation import quat_xyzw_to_matrix
 from freegeo.geometry.se3 import camera_centres, from_Rt
@@ -53,12 +53,12 @@ def write_example(
     if truth:
         exact.save(folder / "truth")
     curve = [{"total": 0.02 * 0.97**k, "intra": 0.005 * 0.97**k, "cross": 0.015 * 0.97**k} for k in range(60)]
-    storage.write_json(
+    files.write_json(
         folder / "adapter/freegeo.json", {"format": 1, "base": {"model": "example"}, "loss_curve": curve, "seed": 43}
     )
     row = {"auc05": 0.5, "auc15": 0.6, "auc30": 0.7, "abs_rel": 0.1, "f1_rel5": 0.4}
-    storage.write_json(folder / "scores.json", {key: {"4": row, "8": row} for key in ("frozen", "adapted")})
-    storage.write_json(
+    files.write_json(folder / "scores.json", {key: {"4": row, "8": row} for key in ("frozen", "adapted")})
+    files.write_json(
         folder / "reconstruction.json",
         {
             "format": 1,

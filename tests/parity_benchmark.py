@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from freegeo.benchmark import sampling
-from freegeo.benchmark.cloud import score_clouds, voxel_average
 from freegeo.benchmark.evaluate import (
     fuse_scene,
     load_reference,
@@ -25,12 +24,13 @@ from freegeo.benchmark.evaluate import (
     with_mean,
 )
 from freegeo.benchmark.frames import fusion_frames
-from freegeo.benchmark.pose import pair_errors, pose_auc
-from freegeo.data import datasets
 from freegeo.data.colmap_files import read_cameras, read_images
-from freegeo.data.scannetpp import undistorted
+from freegeo.data.datasets import registry as datasets
+from freegeo.data.datasets.scannetpp import undistorted
 from freegeo.fusion.mesh import Mesh, empty_mesh_substitute, sample_surface
 from freegeo.fusion.tsdf import TsdfVolume
+from freegeo.metrics.cloud import score_clouds, voxel_average
+from freegeo.metrics.pose import pair_errors, pose_auc
 
 Case = tuple[str, Callable[[], float]]
 FAILED = float("inf")

@@ -11,18 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from freegeo import storage
+from freegeo import files
+from freegeo import run_folder as run_folders
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.storage import (
-    LEDGER_FILE,
-    LOCK_FILE,
-    STATE_FILE,
-    atomic_path,
-    check_folder,
-    locked,
-    run_folder,
-    write_json,
-)
+from freegeo.files import LEDGER_FILE, LOCK_FILE, STATE_FILE, atomic_path, write_json
+from freegeo.run_folder import check_folder, locked, run_folder
 
 SETTINGS = {"model": "tiny", "recipe": {"steps": 2, "keep": (0, 2)}, "seed": 1}
 HIDDEN = {STATE_FILE, LOCK_FILE, LEDGER_FILE}
@@ -74,10 +67,10 @@ def test_failure_inside_the_block_keeps_the_old_file_and_leaves_nothing(tmp_path
 
 def test_every_writer_reads_back_and_replaces(tmp_path):
     for value in (1.0, 2.0):
-        storage.write_json(tmp_path / "a.json", {"ö": value})
-        storage.write_npz(tmp_path / "a.npz", {"x": np.full(3, value)})
-        storage.write_tensors(tmp_path / "a.safetensors", {"x": torch.full((2, 3), value).T}, {"key": "text"})
-    assert storage.read_json(tmp_path / "a.json") == {"ö": 2.0}
+        files.write_json(tmp_path / "a.json", {"ö": value})
+        files.write_npz(tmp_path / "a.npz", {"x": np.full(3, value)})
+        files.write_tensors(tmp_path / "a.safetensors", {"x": torch.full((2, 3), value).T}, {"key": "text"})
+    assert files.read_json(tmp_path / "a.json") == {"ö": 2.0}
     assert (np.load(tmp_path / "a.npz")["x"] == 2).all()
     from safetensors import safe_open
 
@@ -90,7 +83,7 @@ def test_every_writer_reads_back_and_replaces(tmp_path):
 def test_files_are_readable_by_others_as_the_umask_says(tmp_path):
     before = os.umask(0o022)
     try:
-        storage.write_tensors(tmp_path / "a.safetensors", {"x": torch.zeros(1)})
+        files.write_tensors(tmp_path / "a.safetensors", {"x": torch.zeros(1)})
     finally:
         os.umask(before)
     assert (tmp_path / "a.safetensors").stat().st_mode & 0o777 == 0o644
@@ -99,7 +92,7 @@ def test_files_are_readable_by_others_as_the_umask_says(tmp_path):
 def test_damaged_json_names_the_file(tmp_path):
     (tmp_path / "a.json").write_text('{"half": ')
     with pytest.raises(FreeGeoError, match=r"a\.json: damaged file"):
-        storage.read_json(tmp_path / "a.json")
+        files.read_json(tmp_path / "a.json")
 
 
 def test_folder_that_cannot_be_written_to_is_one_sentence(tmp_path, monkeypatch):
@@ -116,7 +109,7 @@ def test_folder_that_cannot_be_written_to_is_one_sentence(tmp_path, monkeypatch)
 
 def test_second_process_is_refused_and_the_lock_dies_with_its_holder(tmp_path):
     code = f"""
-from freegeo.storage import locked
+from freegeo.run_folder import locked
 with locked(Path({str(tmp_path)!r})):
     print("READY", flush=True)
     time.sleep(60)
@@ -267,7 +260,7 @@ def test_removal_that_is_cut_short_does_not_pass_for_a_finished_result(tmp_path,
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(storage, "_remove_parts", stop)
+        patch.setattr(run_folders, "_remove_parts", stop)
         with pytest.raises(KeyboardInterrupt), run_folder(tmp_path, {}, overwrite=True):
             pass
     with run_folder(tmp_path, SETTINGS) as run:
@@ -319,7 +312,7 @@ def test_folder_without_write_permission(tmp_path, monkeypatch):
 def test_newer_format_is_left_alone(tmp_path, overwrite):
     result(tmp_path)
     state = json.loads((tmp_path / STATE_FILE).read_text())
-    (tmp_path / STATE_FILE).write_text(json.dumps({**state, "format": storage.FORMAT + 1}))
+    (tmp_path / STATE_FILE).write_text(json.dumps({**state, "format": files.FORMAT + 1}))
     with pytest.raises(UserError, match="newer freegeo"), run_folder(tmp_path, SETTINGS, overwrite=overwrite):
         pass
     assert visible(tmp_path) == {"result.json", "deep/part.json"}
@@ -334,7 +327,8 @@ def test_damaged_state_is_an_error_with_the_files_name(tmp_path, text):
 
 def test_killed_process_leaves_the_old_file_and_its_half_file_is_cleared_away(tmp_path):
     code = f"""
-from freegeo.storage import run_folder, atomic_path, write_json
+from freegeo.files import atomic_path, write_json
+from freegeo.run_folder import run_folder
 with run_folder(Path({str(tmp_path)!r}), {{"a": 1}}) as run:
     write_json(run / "deep" / "a.json", "old")
     with atomic_path(run / "deep" / "a.json") as part:
@@ -345,7 +339,7 @@ with run_folder(Path({str(tmp_path)!r}), {{"a": 1}}) as run:
     process = child(code)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert storage.read_json(tmp_path / "deep" / "a.json") == "old"
+    assert files.read_json(tmp_path / "deep" / "a.json") == "old"
     assert len(visible(tmp_path)) == 2
     with run_folder(tmp_path, {"a": 1}) as run:
         assert not run.finished

@@ -15,7 +15,7 @@ _HOMES = {
     "load_photos": "freegeo.data.photos",
     "adapt": "freegeo.pipeline",
     "reconstruct": "freegeo.pipeline",
-    "evaluate": "freegeo.benchmark.scene_score",
+    "evaluate": "freegeo.metrics.scene",
 }
 
 __all__ = ["__version__", *_HOMES]

@@ -28,10 +28,11 @@ from freegeo.export.formats import export, filter_reconstruction
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import FILE_NAME as PREDICTION_NAME
 from freegeo.export.reconstruction import Reconstruction
+from freegeo.files import FORMAT, read_json, write_json
 from freegeo.fusion.filtering import FilterReport, FilterSettings
 from freegeo.models.precision import Precision, autocast
 from freegeo.report.page import write_report
-from freegeo.storage import FORMAT, RunFolder, read_json, write_json
+from freegeo.run_folder import RunFolder
 from freegeo.types import ImageBatch, PhotoLike
 
 if TYPE_CHECKING:

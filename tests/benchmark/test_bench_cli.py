@@ -7,7 +7,7 @@ from bench_tools import DATASET, ROOMS
 from fixture_tools import fixture_path
 from freegeo.benchmark.check import check_data, check_dataset
 from freegeo.cli.app import main
-from freegeo.data import eth3d
+from freegeo.data.datasets import eth3d
 
 BENCH = fixture_path("benchmark", "datasets")
 

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 
-from freegeo.benchmark.cloud import f1_rel5, morton_order, nearest_distances, score_clouds, voxel_average
 from freegeo.errors import UserError
 from freegeo.geometry.rotation import so3_exp
 from freegeo.geometry.se3 import from_Rt
+from freegeo.metrics.cloud import f1_rel5, morton_order, nearest_distances, score_clouds, voxel_average
 
 RNG = np.random.default_rng(0)
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from freegeo.benchmark.bootstrap import paired_interval
-from freegeo.benchmark.depth import score_depth
 from freegeo.errors import UserError
+from freegeo.metrics.bootstrap import paired_interval
+from freegeo.metrics.depth import score_depth
 
 
 def test_the_median_scale_removes_any_scale():

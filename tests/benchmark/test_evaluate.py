@@ -8,7 +8,6 @@ import torch
 
 from fixture_tools import fixture_path
 from freegeo.benchmark import evaluate
-from freegeo.benchmark.cloud import ReferenceCloud
 from freegeo.benchmark.evaluate import (
     SceneReference,
     load_reference,
@@ -20,9 +19,10 @@ from freegeo.benchmark.evaluate import (
     with_mean,
 )
 from freegeo.benchmark.frames import fusion_frames
-from freegeo.data import datasets
+from freegeo.data.datasets import registry as datasets
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.fusion.mesh import read_mesh
+from freegeo.metrics.cloud import ReferenceCloud
 
 FOLDER = fixture_path("benchmark")
 

@@ -1,10 +1,10 @@
 import pytest
 
 from freegeo.adaptation.recipe import named
-from freegeo.benchmark.experiments import EXPERIMENTS, ROOMS, chosen, datasets_of
-from freegeo.benchmark.paper import Cell, paper_table
-from freegeo.benchmark.tables import NAMES, published_value
-from freegeo.benchmark.variants import VARIANTS, variant
+from freegeo.benchmark.paper.experiments import EXPERIMENTS, ROOMS, chosen, datasets_of
+from freegeo.benchmark.paper.published import Cell, paper_table
+from freegeo.benchmark.paper.tables import NAMES, published_value
+from freegeo.benchmark.paper.variants import VARIANTS, variant
 from freegeo.errors import UserError
 from tiny_models import tiny_da3
 

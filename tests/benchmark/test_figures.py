@@ -2,10 +2,10 @@ import numpy as np
 from PIL import Image
 
 from bench_tools import DATASET, ROOMS, store_truth, task
-from freegeo.benchmark.figures import CloudPanel, cloud_figure, curve_figure, depth_panel, draw_all, save_figure
+from freegeo.benchmark.paper.figures import CloudPanel, cloud_figure, curve_figure, depth_panel, draw_all, save_figure
 from freegeo.benchmark.results import rows_of
 from freegeo.benchmark.score import evaluate_all
-from freegeo.data.datasets import load_scene
+from freegeo.data.datasets.registry import load_scene
 
 
 def test_a_benchmark_folder_gets_its_figures_in_both_formats(tmp_path, small_rooms):

@@ -3,10 +3,10 @@ import math
 import pytest
 import torch
 
-from freegeo.benchmark.pose import area_under_curve, pair_errors, pose_auc, score_poses
 from freegeo.errors import UserError
 from freegeo.geometry.rotation import so3_exp
 from freegeo.geometry.se3 import from_Rt
+from freegeo.metrics.pose import area_under_curve, pair_errors, pose_auc, score_poses
 
 
 def trajectory(views: int, seed: int = 0) -> torch.Tensor:

@@ -9,9 +9,9 @@ from bench_tools import CONFIGURATION, DATASET, ROOMS, store_truth, task
 from freegeo.benchmark.results import COLUMNS, Row, choose, paired, read_results, rows_of, write_results
 from freegeo.benchmark.score import EMPTY_SURFACE, evaluate_all
 from freegeo.benchmark.tasks import PREDICTION_FILE, finish
-from freegeo.data.datasets import load_scene
+from freegeo.data.datasets.registry import load_scene
 from freegeo.errors import UserError
-from freegeo.storage import write_json
+from freegeo.files import write_json
 
 
 @pytest.fixture

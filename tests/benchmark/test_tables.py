@@ -4,10 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from freegeo.benchmark.bootstrap import Interval
-from freegeo.benchmark.experiments import EXPERIMENTS, PAPER_BUDGETS
-from freegeo.benchmark.results import Row
-from freegeo.benchmark.tables import (
+from freegeo.benchmark.paper.experiments import EXPERIMENTS, PAPER_BUDGETS
+from freegeo.benchmark.paper.tables import (
     as_csv,
     as_latex,
     as_markdown,
@@ -17,6 +15,8 @@ from freegeo.benchmark.tables import (
     mean_of_changes,
     verdict,
 )
+from freegeo.benchmark.results import Row
+from freegeo.metrics.bootstrap import Interval
 
 SCENES = [f"scene {k}" for k in range(6)]
 

@@ -23,7 +23,7 @@ from freegeo.benchmark.tasks import (
     run_each,
     stored_tasks,
 )
-from freegeo.data.datasets import load_scene
+from freegeo.data.datasets.registry import load_scene
 from freegeo.errors import UserError
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from cli.conftest import QUICK
 from freegeo.cli import demo, sources
-from freegeo.storage import STATE_FILE
+from freegeo.files import STATE_FILE
 
 SCORE = {"auc05": 0.1, "auc15": 0.2, "auc30": 0.5, "abs_rel": 0.2, "f1_rel5": 0.3}
 

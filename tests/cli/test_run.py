@@ -16,8 +16,8 @@ from cli.conftest import PHOTOS, QUICK
 from freegeo.adaptation import trainer
 from freegeo.adaptation.trainer import STATE_FILE
 from freegeo.export import formats
-from freegeo.storage import LEDGER_FILE, LOCK_FILE
-from freegeo.storage import STATE_FILE as RUN_FILE
+from freegeo.files import LEDGER_FILE, LOCK_FILE
+from freegeo.files import STATE_FILE as RUN_FILE
 
 ADAPTER_FILES = {"adapter_config.json", "adapter_model.safetensors", "camera_token.safetensors", "freegeo.json"}
 RESULT_FILES = {"reconstruction.json", "prediction.npz", "points.ply", "scene.glb"}
@@ -279,7 +279,7 @@ main({arguments!r})
 
 
 def test_two_processes_do_not_write_into_one_folder(freegeo, photo_folder, tiny, tmp_path):
-    from freegeo.storage import locked
+    from freegeo.run_folder import locked
 
     with locked(tmp_path):
         outcome = freegeo("run", photo_folder, "-o", tmp_path, *tiny, *QUICK)

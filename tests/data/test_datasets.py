@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from fixture_tools import fixture_path
-from freegeo.data import datasets, eth3d, hiroom, scannetpp, sevenscenes
 from freegeo.data.colmap_files import read_cameras, read_images
+from freegeo.data.datasets import eth3d, hiroom, scannetpp, sevenscenes
+from freegeo.data.datasets import registry as datasets
 from freegeo.data.scene import Scene
 from freegeo.errors import FreeGeoError, UserError
 

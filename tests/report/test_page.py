@@ -9,7 +9,7 @@ import pytest
 
 from exact_rooms import room
 from example_results import HOSTILE_NAME, write_example
-from freegeo import storage
+from freegeo import files
 from freegeo.report import figures, scene3d
 from freegeo.report.page import flattened, score_table, write_report
 from freegeo.report.result import load_result
@@ -78,9 +78,9 @@ def test_a_frozen_run_without_cameras_has_a_page(tmp_path):
 
 def test_the_filters_that_the_run_noted_are_shown(tmp_path):
     folder = write_example(tmp_path / "out", truth=False)
-    summary = storage.read_json(folder / "reconstruction.json")
+    summary = files.read_json(folder / "reconstruction.json")
     summary["filters"] = {"pixels": 1000, "removed": {"mask": 123, "sky": 0}}
-    storage.write_json(folder / "reconstruction.json", summary)
+    files.write_json(folder / "reconstruction.json", summary)
     text = write_report(folder).read_text(encoding="utf-8")
     assert re.search(r"outside the user&#39;s masks</th><td>123</td><td>12.3 %", text)
     assert re.search(r"kept</th><td>877</td><td>87.7 %", text)

@@ -6,7 +6,7 @@ import torch
 
 from exact_rooms import room
 from example_results import disturbed, rotation_about_z, write_example
-from freegeo import storage
+from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.geometry.sim3 import Sim3
 from freegeo.report.result import align, camera_difference, load_result, moved, relative_error
@@ -59,7 +59,7 @@ def test_a_frozen_run_has_one_stage(tmp_path):
     result = load_result(tmp_path)
     assert list(result.stages) == ["frozen"]
     assert result.summary == {}
-    storage.write_json(tmp_path / "reconstruction.json", {"format": 1, "adapter": "/elsewhere"})
+    files.write_json(tmp_path / "reconstruction.json", {"format": 1, "adapter": "/elsewhere"})
     assert list(load_result(tmp_path).stages) == ["adapted"]
 
 
@@ -87,13 +87,13 @@ def test_folders_that_cannot_be_read_say_so(tmp_path):
     with pytest.raises(UserError, match="holds no reconstruction"):
         load_result(tmp_path)
     room(3).save(tmp_path)
-    storage.write_json(tmp_path / "reconstruction.json", {"format": 99})
+    files.write_json(tmp_path / "reconstruction.json", {"format": 99})
     with pytest.raises(UserError, match="newer freegeo"):
         load_result(tmp_path)
-    storage.write_json(tmp_path / "reconstruction.json", [])
+    files.write_json(tmp_path / "reconstruction.json", [])
     with pytest.raises(FreeGeoError, match="damaged"):
         load_result(tmp_path)
-    storage.write_json(tmp_path / "reconstruction.json", {})
+    files.write_json(tmp_path / "reconstruction.json", {})
     room(4).save(tmp_path / "frozen")
     with pytest.raises(FreeGeoError, match="different sizes"):
         load_result(tmp_path)

@@ -10,8 +10,8 @@ import torch
 from safetensors import safe_open
 
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.files import read_json
 from freegeo.models.catalog import load_model
-from freegeo.storage import read_json
 from freegeo.training import loop, pool, state
 from freegeo.training.loop import train
 

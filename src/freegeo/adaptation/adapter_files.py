@@ -18,8 +18,8 @@ from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.peft_files import lora_layers, read_peft, write_peft
 from freegeo.adaptation.published import is_published, own_names, read_camera_token
 from freegeo.errors import UserError
+from freegeo.files import FORMAT, read_json, write_json, write_tensors
 from freegeo.models.checkpoints import read_tensors, require_match
-from freegeo.storage import FORMAT, read_json, write_json, write_tensors
 
 if TYPE_CHECKING:
     from freegeo.models.api import ReconstructionModel

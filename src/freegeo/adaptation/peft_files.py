@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from freegeo.errors import UserError
+from freegeo.files import atomic_path, read_json, write_tensors
 from freegeo.models.checkpoints import read_tensors
-from freegeo.storage import atomic_path, read_json, write_tensors
 
 if TYPE_CHECKING:
     from freegeo.adaptation.adapter import Adapter

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from freegeo.adaptation.peft_files import lora_layers, write_peft
 from freegeo.errors import UserError
+from freegeo.files import atomic_path
 from freegeo.models.checkpoints import read_tensors
-from freegeo.storage import atomic_path
 
 if TYPE_CHECKING:
     from freegeo.adaptation.adapter import Adapter

@@ -15,7 +15,7 @@ from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.images import SceneImages
 from freegeo.adaptation.recipe import Recipe
 from freegeo.errors import UserError
-from freegeo.storage import write_tensors
+from freegeo.files import write_tensors
 
 
 def run_identity(model: str, scenes: Sequence[SceneImages], recipe: Recipe, seed: int) -> str:

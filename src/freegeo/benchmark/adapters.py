@@ -29,10 +29,10 @@ from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
 from freegeo.adaptation.trainer import STATE_FILE, Adapted, Progress, adapt
 from freegeo.adaptation.views import schedule
 from freegeo.benchmark.tasks import DAMAGED, Problem, plain, reason_of
-from freegeo.data.datasets import load_scene
+from freegeo.data.datasets.registry import load_scene
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.files import read_json, write_json
 from freegeo.models.api import ReconstructionModel
-from freegeo.storage import read_json, write_json
 
 logger = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from freegeo.benchmark.tasks import DAMAGED, reason_of
-from freegeo.data import datasets
+from freegeo.data.datasets import registry as datasets
 from freegeo.data.procedural.splits import PREFIX
 from freegeo.errors import UserError
 

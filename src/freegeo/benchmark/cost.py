@@ -13,15 +13,15 @@ import torch
 from freegeo.adaptation.images import SceneImages
 from freegeo.adaptation.recipe import Recipe
 from freegeo.adaptation.trainer import adapt
-from freegeo.benchmark.cloud import ReferenceCloud
+from freegeo.benchmark.paper.variants import variant
 from freegeo.benchmark.predict import Predictor
 from freegeo.benchmark.tasks import DAMAGED, SAMPLE, Task
-from freegeo.benchmark.variants import variant
-from freegeo.data.datasets import load_scene, protocol
-from freegeo.data.protocol import Protocol
+from freegeo.data.datasets.base import Protocol
+from freegeo.data.datasets.registry import load_scene, protocol
 from freegeo.fusion.mesh import sample_surface
 from freegeo.fusion.tsdf import TsdfVolume
 from freegeo.geometry.camera import K_from_fov
+from freegeo.metrics.cloud import ReferenceCloud
 
 MEASURED_STEPS = 3
 MEASURED_FRAMES = 2

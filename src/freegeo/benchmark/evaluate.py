@@ -14,17 +14,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from freegeo.benchmark.cloud import CloudScore, ReferenceCloud
 from freegeo.benchmark.frames import fusion_frames, require_prediction, require_truth
-from freegeo.benchmark.pose import score_poses
-from freegeo.data.datasets import protocol
-from freegeo.data.protocol import Protocol, SceneTruth
+from freegeo.data.datasets.base import Protocol, SceneTruth
+from freegeo.data.datasets.registry import protocol
 from freegeo.data.scene import Scene
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.files import write_npz
 from freegeo.fusion.mesh import Mesh, empty_mesh_substitute, read_mesh, read_points, sample_surface
 from freegeo.fusion.tsdf import TsdfVolume
 from freegeo.geometry import se3
-from freegeo.storage import write_npz
+from freegeo.metrics.cloud import CloudScore, ReferenceCloud
+from freegeo.metrics.pose import score_poses
 from freegeo.types import Prediction
 
 logger = logging.getLogger(__name__)

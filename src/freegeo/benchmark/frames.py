@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from freegeo.data.datasets import protocol, valid_mask
-from freegeo.data.protocol import Protocol, SceneTruth
+from freegeo.data.datasets.base import Protocol, SceneTruth
+from freegeo.data.datasets.registry import protocol, valid_mask
 from freegeo.data.scene import Scene
 from freegeo.errors import UserError
 from freegeo.geometry.camera import resize_K

@@ -22,6 +22,7 @@ from freegeo.adaptation.recipe import Recipe
 from freegeo.adaptation.trainer import Progress
 from freegeo.benchmark.adapters import AdapterJob, peak_memory_gb, reset_peak_memory, train, use
 from freegeo.benchmark.frames import require_truth
+from freegeo.benchmark.paper.variants import Variant, variant
 from freegeo.benchmark.stored import write_stored
 from freegeo.benchmark.tasks import (
     MEASURED_FILE,
@@ -35,17 +36,16 @@ from freegeo.benchmark.tasks import (
     run_each,
     unique,
 )
-from freegeo.benchmark.variants import Variant, variant
-from freegeo.data.datasets import load_scene, scene_names
+from freegeo.data.datasets.registry import load_scene, scene_names
 from freegeo.data.procedural.splits import PREFIX
 from freegeo.data.scene import Scene
 from freegeo.errors import UserError
+from freegeo.files import write_json
 from freegeo.geometry import se3
 from freegeo.geometry.camera import resize_K
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.catalog import load_model
 from freegeo.models.precision import Precision, autocast, choose_device, choose_precision
-from freegeo.storage import write_json
 from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
 
 AdaptPer = Literal["dataset", "scene"]

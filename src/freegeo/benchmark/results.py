@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from freegeo.benchmark.bootstrap import Interval, paired_interval
 from freegeo.benchmark.tasks import FrameRule, Task
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.storage import atomic_path
+from freegeo.files import atomic_path
+from freegeo.metrics.bootstrap import Interval, paired_interval
 
 CSV_FILE, LINES_FILE = "results.csv", "results.jsonl"
 SMALLER_IS_BETTER = ("overall", "acc", "comp", "abs_rel", "mse", "seconds", "peak_gb", "trainable")

@@ -16,8 +16,6 @@ from typing import Any
 import torch
 
 from freegeo.benchmark.adapters import FINISHED, FOLDER
-from freegeo.benchmark.cloud import f1_rel5
-from freegeo.benchmark.depth import score_depth
 from freegeo.benchmark.evaluate import (
     GROUND_TRUTH,
     SceneReference,
@@ -26,9 +24,9 @@ from freegeo.benchmark.evaluate import (
     score_scene_surface,
 )
 from freegeo.benchmark.frames import require_prediction
+from freegeo.benchmark.paper.variants import variant
 from freegeo.benchmark.predict import problem_of
 from freegeo.benchmark.results import Row, rows_of, write_results
-from freegeo.benchmark.scene_score import at_size
 from freegeo.benchmark.stored import Stored, read_stored
 from freegeo.benchmark.tasks import (
     MEASURED_FILE,
@@ -41,11 +39,13 @@ from freegeo.benchmark.tasks import (
     run_each,
     stored_tasks,
 )
-from freegeo.benchmark.variants import variant
-from freegeo.data.datasets import load_scene, true_depth
+from freegeo.data.datasets.registry import load_scene, true_depth
 from freegeo.data.scene import Scene
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.storage import read_json, write_json
+from freegeo.files import read_json, write_json
+from freegeo.metrics.cloud import f1_rel5
+from freegeo.metrics.depth import score_depth
+from freegeo.metrics.scene import at_size
 
 EMPTY_SURFACE = "the fusion gave no surface: precision, recall and F1 are 0, distances do not exist"
 _SAME_IN_ALL = ("model", "checkpoint", "precision", "given_cameras")

@@ -13,7 +13,7 @@ import torch
 
 from freegeo.benchmark.tasks import PREDICTION_FILE, Task
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.storage import write_npz
+from freegeo.files import write_npz
 from freegeo.types import Prediction
 
 ARRAYS = ("depth_z", "T_cam_world", "K")

@@ -25,8 +25,8 @@ import torch
 
 from freegeo.benchmark import sampling
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.files import read_json, write_json
 from freegeo.models.api import AdaptationDefaults
-from freegeo.storage import read_json, write_json
 
 logger = logging.getLogger(__name__)
 

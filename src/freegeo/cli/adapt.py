@@ -45,7 +45,7 @@ def adapt(
     """
     from freegeo.adaptation.bank import SceneImages
     from freegeo.pipeline import require_enough_photos, settings_of
-    from freegeo.storage import check_folder, run_folder
+    from freegeo.run_folder import check_folder, run_folder
 
     scenes = {str(part[0]): load_source(part, photos) for part in split_scenes(sources)}
     for found in scenes.values():

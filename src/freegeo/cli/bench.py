@@ -13,7 +13,7 @@ from freegeo.cli import console
 from freegeo.errors import FreeGeoError, UserError
 
 if TYPE_CHECKING:
-    from freegeo.benchmark.experiments import Experiment
+    from freegeo.benchmark.paper.experiments import Experiment
     from freegeo.benchmark.predict import Predictor
     from freegeo.benchmark.tasks import FrameRule, Problem, Task
     from freegeo.models.api import AdaptationDefaults
@@ -92,7 +92,7 @@ DEFAULT_BENCH, DEFAULT_MODEL = BenchOptions(), BenchModel()
 @app.command(name="list")
 def list_experiments() -> None:
     """List the experiments."""
-    from freegeo.benchmark.experiments import EXPERIMENTS
+    from freegeo.benchmark.paper.experiments import EXPERIMENTS
 
     rows = [(entry.name, entry.title) for entry in EXPERIMENTS.values()]
     width = max(len(name) for name, _ in rows)
@@ -223,7 +223,7 @@ def _prepare(
     experiments: Sequence[str], bench: BenchOptions, model: BenchModel, overwrite: bool
 ) -> tuple[Predictor, list[Task]]:
     """Return the predictor and the tasks of a run."""
-    from freegeo.benchmark.experiments import chosen, datasets_of
+    from freegeo.benchmark.paper.experiments import chosen, datasets_of
     from freegeo.benchmark.predict import Predictor, Setup, listed_scenes
     from freegeo.benchmark.tasks import unique
     from freegeo.cli.options import use_few_threads
@@ -264,7 +264,7 @@ def _predict(
 ) -> list[Problem]:
     from freegeo.benchmark.cost import estimate, estimate_scoring
     from freegeo.benchmark.predict import predict_all
-    from freegeo.storage import locked
+    from freegeo.run_folder import locked
 
     waiting = predictor.unfinished(tasks)
     console.say(f"{len(tasks)} tasks, {len(tasks) - len(waiting)} of them finished")
@@ -316,10 +316,10 @@ def _evaluate(bench: BenchOptions, device: str | None, *, wanted: list[Task] | N
 
 def _tables(experiments: Sequence[str], bench: BenchOptions) -> None:
     """Print the tables as text and write them in every format."""
-    from freegeo.benchmark.experiments import chosen
+    from freegeo.benchmark.paper.experiments import chosen
+    from freegeo.benchmark.paper.tables import FORMATS, as_text, experiment_tables
     from freegeo.benchmark.results import read_results
-    from freegeo.benchmark.tables import FORMATS, as_text, experiment_tables
-    from freegeo.storage import atomic_path
+    from freegeo.files import atomic_path
 
     rows = read_results(bench.output)
     family = _adaptation(rows[0].model).published if rows else None
@@ -354,7 +354,7 @@ def _rule(bench: BenchOptions, model: str) -> FrameRule:
 
 
 def _figures(bench: BenchOptions) -> None:
-    from freegeo.benchmark.figures import draw_all
+    from freegeo.benchmark.paper.figures import draw_all
 
     for path in draw_all(bench.data, bench.output):
         console.say(str(path))
@@ -372,7 +372,7 @@ def _require_none(problems: Sequence[Problem], out: Path) -> None:
     """Store what failed and end with exit code 1 when anything did."""
     from dataclasses import asdict
 
-    from freegeo.storage import write_json
+    from freegeo.files import write_json
 
     if not problems:
         (out / PROBLEMS_FILE).unlink(missing_ok=True)
@@ -386,9 +386,9 @@ def _require_none(problems: Sequence[Problem], out: Path) -> None:
 
 
 def _datasets(text: str) -> list[str]:
-    from freegeo.benchmark.experiments import ROOMS
+    from freegeo.benchmark.paper.experiments import ROOMS
     from freegeo.benchmark.tasks import unique
-    from freegeo.data.datasets import DATASETS
+    from freegeo.data.datasets.registry import DATASETS
 
     names = unique([name for part in _split(text) for name in (ROOMS if part == "procedural" else (part,))])
     unknown = [name for name in names if name not in DATASETS]

@@ -12,7 +12,7 @@ from freegeo.cli import console
 from freegeo.cli.jobs import run_job, save_frames
 from freegeo.cli.options import DemoModelOptions, OutputOptions, RecipeOptions
 from freegeo.cli.sources import DEMO_DOMAIN, demo_scene
-from freegeo.storage import read_json, write_json
+from freegeo.files import read_json, write_json
 
 if TYPE_CHECKING:
     from freegeo.data.scene import Scene
@@ -69,8 +69,8 @@ def demo(
 
 def true_reconstruction(job: Job, scene: Scene) -> Reconstruction:
     """Return the ground truth at the model's size, for the report."""
-    from freegeo.benchmark.scene_score import at_size
     from freegeo.export.reconstruction import Reconstruction
+    from freegeo.metrics.scene import at_size
     from freegeo.types import Prediction
 
     assert scene.depth_z is not None and scene.K is not None
@@ -90,7 +90,7 @@ def score_windows(job: Job, scene: Scene) -> dict[str, Any]:
 
 def mean_score(job: Job, scene: Scene, views: int) -> dict[str, float]:
     """Score the model as it stands."""
-    from freegeo.benchmark.scene_score import evaluate
+    from freegeo.metrics.scene import evaluate
     from freegeo.pipeline import predict
 
     rows = []
@@ -111,7 +111,7 @@ def windows(count: int, views: int) -> list[list[int]]:
 
 def report(scores: dict[str, Any], domain: str) -> None:
     """Print the table and what it says."""
-    from freegeo.benchmark.scene_score import PRINTED
+    from freegeo.metrics.scene import PRINTED
 
     header = ("views", "model", *(name.replace("auc0", "auc") for name in PRINTED))
     rows = [

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from freegeo.cli import console
 from freegeo.cli.files import FileOptions
 from freegeo.cli.options import ModelOptions, OutputOptions
-from freegeo.storage import check_folder, run_folder
+from freegeo.run_folder import check_folder, run_folder
 
 if TYPE_CHECKING:
     from freegeo.adaptation.images import SceneImages
@@ -126,7 +126,7 @@ def save_frames(photos: Sequence[PhotoLike], folder: Path) -> None:
     """Write photos that are in no file of their own as PNG, under the names that exports refer to."""
     from PIL import Image
 
-    from freegeo.storage import atomic_path
+    from freegeo.files import atomic_path
 
     for photo in photos:
         path = folder / f"{Path(photo.name).stem}.png"

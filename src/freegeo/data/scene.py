@@ -8,7 +8,7 @@ from typing import Self
 
 from torch import Tensor
 
-from freegeo.data.protocol import SceneTruth
+from freegeo.data.datasets.base import SceneTruth
 from freegeo.errors import UserError
 from freegeo.types import PhotoLike
 

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from freegeo import storage
+from freegeo import files
 from freegeo.export.reconstruction import Reconstruction
 
 FOLDER = "depth"
@@ -31,12 +31,12 @@ def write_depth(reconstruction: Reconstruction, folder: Path, *, keep: np.ndarra
     text.add_text("depth_scale", repr(scale))
     paths = []
     for name, view in zip(depth_names(reconstruction.names), values, strict=True):
-        with storage.atomic_path(folder / name) as part:
+        with files.atomic_path(folder / name) as part:
             Image.fromarray(view).save(part, pnginfo=text, compress_level=1)
         paths.append(folder / name)
     maps = dict(zip(reconstruction.names, depth_names(reconstruction.names), strict=True))
     meaning = "depth along the optical axis = value * scale; 0: no depth"
-    storage.write_json(folder / "depth.json", {"scale": scale, "meaning": meaning, "maps": maps})
+    files.write_json(folder / "depth.json", {"scale": scale, "meaning": meaning, "maps": maps})
     return [*paths, folder / "depth.json"]
 
 

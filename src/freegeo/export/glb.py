@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from freegeo import storage
+from freegeo import files
 from freegeo.export.ply import require_points
 from freegeo.fusion.points import PointCloud
 
@@ -59,7 +59,7 @@ def write_glb(cloud: PointCloud, T_cam_world: np.ndarray, K: np.ndarray, image_h
         colours = np.tile(colour, (len(vertices), 1))
         mesh = trimesh.Trimesh(opencv_to_gltf(vertices), faces, vertex_colors=colours, process=False)
         scene.add_geometry(mesh, geom_name=f"camera_{view:03d}", node_name=f"camera_{view:03d}")
-    with storage.atomic_path(path) as part:
+    with files.atomic_path(path) as part:
         part.write_bytes(scene.export(file_type="glb"))
     return path
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from freegeo import storage
+from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.fusion.mesh import Mesh
@@ -94,6 +94,6 @@ def write_mesh(reconstruction: Reconstruction, keep: np.ndarray, path: Path, *, 
     if mesh.is_empty:
         raise FreeGeoError(f"{path}: no surface with voxels of {voxel:.4g}. Choose larger voxels or fewer filters.")
     colours = vertex_colours(mesh, reconstruction, keep, tolerance=TRUNCATION_VOXELS * voxel)
-    with storage.atomic_path(path) as part:
+    with files.atomic_path(path) as part:
         trimesh.Trimesh(mesh.vertices, mesh.triangles, vertex_colors=colours, process=False).export(part)
     return path

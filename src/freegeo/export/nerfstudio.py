@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from freegeo import storage
+from freegeo import files
 from freegeo.export.pixels import corner_K
 from freegeo.export.reconstruction import Reconstruction
 
@@ -51,5 +51,5 @@ def write_nerfstudio(
     ]
     distortion = {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
     cloud = {"ply_file_path": points} if points else {}
-    storage.write_json(path, {"camera_model": "OPENCV", **distortion, **cloud, "frames": frames})
+    files.write_json(path, {"camera_model": "OPENCV", **distortion, **cloud, "frames": frames})
     return path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from freegeo import storage
+from freegeo import files
 from freegeo.errors import FreeGeoError
 from freegeo.fusion.points import PointCloud
 
@@ -16,7 +16,7 @@ def write_ply(cloud: PointCloud, path: Path) -> Path:
     import trimesh
 
     require_points(cloud, path)
-    with storage.atomic_path(path) as part:
+    with files.atomic_path(path) as part:
         trimesh.PointCloud(cloud.points, colors=cloud.colours).export(part)
     return path
 

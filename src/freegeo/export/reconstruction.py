@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from freegeo import storage
+from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ class Reconstruction:
     def save(self, path: Path | str) -> Path:
         """Write the file (`prediction.npz` of `path` when that is a folder) atomically; returns where it is."""
         file = _file(path)
-        storage.write_npz(file, self.arrays())
+        files.write_npz(file, self.arrays())
         return file
 
     @classmethod

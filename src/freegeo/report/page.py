@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from freegeo import storage
+from freegeo import files
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.report import figures
 from freegeo.report.result import LABELS, Result, camera_difference, load_result
@@ -49,7 +49,7 @@ def write_report(folder: Path, *, truth: Reconstruction | None = None) -> Path:
     """
     result = load_result(Path(folder), truth=truth)
     path = result.folder / FILE_NAME
-    with storage.atomic_path(path) as part:
+    with files.atomic_path(path) as part:
         part.write_text(render(result), encoding="utf-8")
     return path
 

@@ -17,10 +17,10 @@ import torch
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.formats import filter_reconstruction
 from freegeo.export.reconstruction import FILE_NAME, Reconstruction
+from freegeo.files import FORMAT, read_json
 from freegeo.geometry.depth import depth_to_world, valid_depth
 from freegeo.geometry.se3 import camera_centres
 from freegeo.geometry.sim3 import Sim3
-from freegeo.storage import FORMAT, read_json
 
 SUMMARY_NAME, SCORES_NAME = "reconstruction.json", "scores.json"
 FROZEN_FOLDER, TRUTH_FOLDER, ADAPTER_PAGE = "frozen", "truth", "adapter/freegeo.json"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from freegeo.errors import UserError
-from freegeo.storage import atomic_path
+from freegeo.files import atomic_path
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:

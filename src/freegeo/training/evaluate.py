@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from freegeo.benchmark.bootstrap import Interval, paired_interval
-from freegeo.benchmark.cloud import f1_rel5
-from freegeo.benchmark.depth import score_depth
-from freegeo.benchmark.pose import pair_errors, pose_auc
 from freegeo.data.procedural import get_domain
+from freegeo.files import write_json
 from freegeo.geometry import se3
 from freegeo.geometry.camera import K_from_fov
+from freegeo.metrics.bootstrap import Interval, paired_interval
+from freegeo.metrics.cloud import f1_rel5
+from freegeo.metrics.depth import score_depth
+from freegeo.metrics.pose import pair_errors, pose_auc
 from freegeo.models.api import ReconstructionModel
-from freegeo.storage import write_json
 from freegeo.training.objective import given
 from freegeo.training.pool import Rooms, image_size, render_rooms
 from freegeo.types import Prediction

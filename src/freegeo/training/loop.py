@@ -17,7 +17,8 @@ from torch import nn
 
 from freegeo import __version__
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.storage import atomic_path, locked, read_json, write_json, write_tensors
+from freegeo.files import atomic_path, read_json, write_json, write_tensors
+from freegeo.run_folder import locked
 from freegeo.training.batches import Batch, draw_batch
 from freegeo.training.config import TrainConfig
 from freegeo.training.evaluate import evaluate

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from freegeo.data.procedural import get_domain, render, sample_rooms
-from freegeo.storage import write_tensors
+from freegeo.files import write_tensors
 
 ROOMS_PER_SHARD = 96
 ASPECTS = ((1, 1), (3, 4), (2, 3))

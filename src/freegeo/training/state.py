@@ -10,11 +10,11 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+from freegeo.files import atomic_path
 from freegeo.models.catalog import EMBEDDED_MODEL, build_empty
 from freegeo.models.da3 import DA3, Backbone
 from freegeo.models.da3_presets import keys
 from freegeo.models.transformer import Block, initialise
-from freegeo.storage import atomic_path
 from freegeo.training.config import TrainConfig
 from freegeo.training.muon import Muon
 from freegeo.training.objective import ReadOuts

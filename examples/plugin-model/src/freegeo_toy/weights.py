@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from freegeo.storage import write_tensors
+from freegeo.files import write_tensors
 from freegeo_toy import ENTRY
 from freegeo_toy.model import Toy
 

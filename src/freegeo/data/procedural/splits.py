@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from freegeo.data.datasets.base import Protocol, SceneTruth
 from freegeo.data.procedural.domains import DOMAINS, get_domain
 from freegeo.data.procedural.photographs import RenderedPhoto, photograph_room
-from freegeo.data.protocol import Protocol, SceneTruth
 from freegeo.data.scene import Scene
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.files import atomic_path, write_npz
 from freegeo.geometry.depth import depth_to_world, valid_depth
-from freegeo.storage import atomic_path, write_npz
 
 PREFIX = "procedural-"
 FRAMES = 16

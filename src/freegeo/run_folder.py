@@ -1,8 +1,7 @@
-"""Writing so that nothing is lost: files appear whole or not at all, folders are locked, runs continue.
+"""Output folders of commands: locked while one writes, continued after a stop, never mixed.
 
 A command's output folder goes through three states: absent, unfinished (its settings are stored, its parts appear one
-by one) and finished (the marker names when). A ledger in the folder lists what freegeo wrote there, so that replacing a
-result never touches a file that somebody put beside it. Only the standard library is used here.
+by one) and finished (the marker names when). Only the standard library is used here.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import secrets
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,87 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.files import FORMAT, LEDGER_FILE, LOCK_FILE, OWN_FILES, STATE_FILE, read_json, write_json
 
-FORMAT = 1
-STATE_FILE = ".freegeo-run.json"
-LOCK_FILE = ".freegeo-lock"
-LEDGER_FILE = ".freegeo-files"
-_OWN_FILES = frozenset({STATE_FILE, LOCK_FILE, LEDGER_FILE})
 _SHOWN = 4
 _PART = re.compile(r"\..+\.[0-9a-f]{8}\.part(\..*)?")
-
-
-@contextmanager
-def atomic_path(path: Path) -> Generator[Path]:
-    """Give a temporary path beside `path` to write to; it takes the final name only when the block succeeds.
-
-    The temporary name keeps the suffix, since writers choose the format by it. UserError when the folder cannot be
-    written to; an OSError while writing, such as a full disk, names the final path.
-    """
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        _flush(temporary)
-        _enter_in_ledger(path)
-        temporary.replace(path)
-    except PermissionError:
-        raise UserError(f"{path.parent}: the folder cannot be written to. Choose another output folder.") from None
-    except OSError as error:
-        if error.errno is None:
-            raise
-        raise OSError(error.errno, error.strerror, str(path)) from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _flush(path: Path) -> None:
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())
-    # Some writers create private files; a result is as readable as any other file of the user.
-    mask = os.umask(0)
-    os.umask(mask)
-    path.chmod(0o666 & ~mask)
-
-
-def _enter_in_ledger(path: Path) -> None:
-    """Note a file in the ledger of the run folder that it lies in, if it lies in one."""
-    path = path.absolute()
-    owner = next((folder for folder in path.parents if (folder / STATE_FILE).is_file()), None)
-    if owner is not None and path.name not in _OWN_FILES:
-        with (owner / LEDGER_FILE).open("a", encoding="utf-8") as file:
-            file.write(path.relative_to(owner).as_posix() + "\n")
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write indented JSON atomically."""
-    with atomic_path(path) as part:
-        part.write_text(json.dumps(value, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-def read_json(path: Path) -> Any:
-    """Read JSON; FreeGeoError when the file is damaged."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise FreeGeoError(f"{path}: damaged file ({error}). Remove it and run again.") from None
-
-
-def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write compressed NumPy arrays atomically."""
-    import numpy as np
-
-    with atomic_path(path) as part:
-        np.savez_compressed(part, **arrays)
-
-
-def write_tensors(path: Path, tensors: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
-    """Write tensors as safetensors atomically."""
-    from safetensors.torch import save_file
-
-    with atomic_path(path) as part:
-        contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-        save_file(contiguous, part, metadata=dict(metadata or {}))
 
 
 @contextmanager
@@ -219,7 +140,7 @@ def check_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool) ->
         raise UserError(f"{path}: is a file. Choose a folder for the output.")
     before = stored_state(path)
     if before is None:
-        if path.is_dir() and any(p.name not in _OWN_FILES for p in path.iterdir()):
+        if path.is_dir() and any(p.name not in OWN_FILES for p in path.iterdir()):
             raise UserError(f"{path}: holds files that freegeo did not write. Choose an empty or a new folder.")
         _require_writable(path)
         return

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from freegeo.benchmark.bootstrap import Interval
-from freegeo.benchmark.experiments import ROOMS, Experiment, Line, datasets_of
-from freegeo.benchmark.paper import FAMILIES, Cell, PaperTable, paper_table
+from freegeo.benchmark.paper.experiments import ROOMS, Experiment, Line, datasets_of
+from freegeo.benchmark.paper.published import FAMILIES, Cell, PaperTable, paper_table
 from freegeo.benchmark.results import SMALLER_IS_BETTER, Row, choose, entries, mean, paired
 from freegeo.benchmark.tasks import FrameRule
+from freegeo.metrics.bootstrap import Interval
 
 EMPTY = ""
 FEWEST_SCENES = 5

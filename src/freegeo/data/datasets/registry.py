@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from freegeo.data import eth3d, hiroom, scannetpp, sevenscenes
+from freegeo.data.datasets import eth3d, hiroom, scannetpp, sevenscenes
+from freegeo.data.datasets.base import Protocol, SceneTruth
 from freegeo.data.procedural.splits import SPLITS, RoomSplit
-from freegeo.data.protocol import Protocol, SceneTruth
 from freegeo.data.scene import Scene
 from freegeo.errors import UserError
 from freegeo.geometry.resample import resize_nearest

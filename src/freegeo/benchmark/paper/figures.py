@@ -15,17 +15,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from freegeo.benchmark.cloud import nearest_distances
-from freegeo.benchmark.depth import score_depth
 from freegeo.benchmark.evaluate import GROUND_TRUTH, fuse_scene, load_reference
+from freegeo.benchmark.paper.tables import NAMES, short_name
 from freegeo.benchmark.results import Row, choose, mean, read_results
 from freegeo.benchmark.stored import read_stored
-from freegeo.benchmark.tables import NAMES, short_name
 from freegeo.benchmark.tasks import DAMAGED, Task, reason_of, stored_tasks
-from freegeo.data.datasets import load_scene, true_depth
+from freegeo.data.datasets.registry import load_scene, true_depth
 from freegeo.data.scene import Scene
+from freegeo.files import atomic_path
 from freegeo.fusion.mesh import sample_surface
-from freegeo.storage import atomic_path
+from freegeo.metrics.cloud import nearest_distances
+from freegeo.metrics.depth import score_depth
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -68,7 +68,7 @@ class PaperTable:
 @cache
 def paper_table(key: str) -> PaperTable:
     """A published table by key; UserError lists the keys."""
-    tables = json.loads((files("freegeo.benchmark") / FILE).read_text(encoding="utf-8"))
+    tables = json.loads((files("freegeo.benchmark.paper") / FILE).read_text(encoding="utf-8"))
     if key not in tables:
         raise UserError(f"The paper has no table {key!r}; known are {', '.join(tables)}.")
     entry = tables[key]

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from freegeo.data.datasets.base import Protocol, SceneTruth, existing, read_gray, require_folder
 from freegeo.data.photos import load_photos
-from freegeo.data.protocol import Protocol, SceneTruth, existing, read_gray, require_folder
 from freegeo.data.scene import Scene
 from freegeo.errors import FreeGeoError
 

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 
 from freegeo.data.colmap_files import read_cameras, read_images
+from freegeo.data.datasets.base import Protocol, SceneTruth, existing, read_gray, require_folder
 from freegeo.data.photos import load_photos
-from freegeo.data.protocol import Protocol, SceneTruth, existing, read_gray, require_folder
 from freegeo.data.scene import Scene
 from freegeo.errors import FreeGeoError
 

@@ -7,13 +7,13 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from freegeo.benchmark.cloud import f1_rel5
-from freegeo.benchmark.depth import score_depth
-from freegeo.benchmark.pose import pair_errors, pose_auc
 from freegeo.data.scene import Scene
 from freegeo.errors import UserError
 from freegeo.geometry.camera import resize_K
 from freegeo.geometry.resample import resize_nearest
+from freegeo.metrics.cloud import f1_rel5
+from freegeo.metrics.depth import score_depth
+from freegeo.metrics.pose import pair_errors, pose_auc
 
 PRINTED = ("auc05", "auc15", "auc30", "abs_rel", "f1_rel5")
 

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from freegeo.benchmark.paper.variants import VARIANTS
 from freegeo.benchmark.sampling import PAPER_BUDGETS, PAPER_SEEDS
 from freegeo.benchmark.tasks import FrameRule, Task, unique
-from freegeo.benchmark.variants import VARIANTS
 from freegeo.data.procedural.splits import FRAMES, PREFIX
 from freegeo.errors import UserError
 

@@ -1,0 +1,1 @@
+"""The experiments of the paper: what is run, the tables and figures, the published numbers."""

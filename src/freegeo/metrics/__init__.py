@@ -1,0 +1,1 @@
+"""Scores of poses, depth and points: pure functions."""
