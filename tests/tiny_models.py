@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.images import SceneImages
+from freegeo.adaptation.samples import SceneImages
 from freegeo.adaptation.recipe import Recipe, scene
 from freegeo.models.api import AdaptationDefaults, ModelSpec, ReconstructionModel
 from freegeo.models.da3 import DA3, DA3Config

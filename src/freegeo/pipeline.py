@@ -6,8 +6,7 @@ import logging
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,13 +15,13 @@ import torch
 
 from freegeo import __version__
 from freegeo.adaptation import recipe as recipes
+from freegeo.adaptation.adapt import Adapted, Progress, loss_change
+from freegeo.adaptation.adapt import adapt as train_adapter
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.adapter_files import PAGE, load_adapter, save_adapter
-from freegeo.adaptation.bank import SceneImages
-from freegeo.adaptation.planner import choose_adaptation, plan_reconstruction
+from freegeo.adaptation.adapter_files import METADATA, load_adapter
+from freegeo.adaptation.memory import plan_reconstruction
 from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
-from freegeo.adaptation.trainer import STATE_FILE, Adapted, Engine, Progress
-from freegeo.adaptation.trainer import adapt as train_adapter
+from freegeo.adaptation.samples import SceneImages
 from freegeo.errors import UserError
 from freegeo.export.formats import export, filter_reconstruction
 from freegeo.export.pixels import masks_for_model
@@ -30,7 +29,8 @@ from freegeo.export.reconstruction import FILE_NAME as PREDICTION_NAME
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import FORMAT, read_json, write_json
 from freegeo.fusion.filtering import FilterReport, FilterSettings
-from freegeo.models.precision import Precision, autocast
+from freegeo.models.api import embed_in_chunks
+from freegeo.models.precision import Compute
 from freegeo.report.page import write_report
 from freegeo.run_folder import RunFolder
 from freegeo.types import ImageBatch, PhotoLike
@@ -43,30 +43,23 @@ logger = logging.getLogger(__name__)
 SUMMARY_NAME = "reconstruction.json"
 FROZEN_FOLDER, ADAPTER_FOLDER = "frozen", "adapter"
 FORMATS = ("ply", "glb")
-VIEWS_PER_CHUNK = 8
 SEED = 43
+CPU = Compute()
 
 
 @torch.no_grad()
 def predict(
-    model: ReconstructionModel,
-    batch: ImageBatch,
-    *,
-    reference: str | None = None,
-    device: torch.device | str = "cpu",
-    precision: Precision = "fp32",
+    model: ReconstructionModel, batch: ImageBatch, *, reference: str | None = None, compute: Compute = CPU
 ) -> Reconstruction:
     """Reconstruct prepared images; an adapter that is in place is used as it stands.
 
-    `reference` None takes the model's own rule. Images are embedded a few at a time.
+    `reference` None takes the model's own rule. UserError when the images do not fit into memory together.
     """
-    device = torch.device(device)
-    model.to(device).eval()
-    arithmetic = partial(autocast, device, precision)
-    with arithmetic():
-        chunks = [batch.images[i : i + VIEWS_PER_CHUNK] for i in range(0, len(batch), VIEWS_PER_CHUNK)]
-        tokens = [model.embed(chunk.to(device)[None]) for chunk in chunks]
-        features = model.aggregate(tokens[0].join_views(tokens), reference=reference or model.spec.reference)
+    plan_reconstruction(model, len(batch), batch.image_hw, compute=compute)
+    model.to(compute.device).eval()
+    with compute.autocast():
+        tokens = embed_in_chunks(model, batch.images, device=compute.device)
+        features = model.aggregate(tokens, reference=reference or model.spec.reference)
     return Reconstruction.from_prediction(model.decode(features), batch)
 
 
@@ -89,17 +82,17 @@ def adapt(
     *,
     recipe: str | Recipe = "scene",
     seed: int = SEED,
-    engine: Engine | None = None,
+    compute: Compute = CPU,
     **options: Any,
 ) -> Adapted:
     """Adapt a model to one scene's photos; the adapter stays in place (`result.adapter.detach()` takes it out).
 
-    `options` are those of `freegeo.adaptation.trainer.adapt`. UserError for fewer than 3 photos.
+    `options` are those of `freegeo.adaptation.adapt.adapt`. UserError for fewer than 3 photos.
     """
     require_enough_photos(photos)
     plan = recipes.named(recipe, model.spec) if isinstance(recipe, str) else recipe
     scene = SceneImages.from_batch("photos", model.preprocess(photos))
-    return train_adapter(model, [scene], plan, seed=seed, engine=engine, **options)
+    return train_adapter(model, [scene], plan, seed=seed, compute=compute, **options)
 
 
 def require_enough_photos(photos: Sequence[PhotoLike]) -> None:
@@ -133,7 +126,7 @@ class Job:
     adapter: Path | None = None
     """A saved adapter to reconstruct with, instead of training one."""
     seed: int = SEED
-    engine: Engine = field(default_factory=Engine)
+    compute: Compute = CPU
     reference: str | None = None
     """Reference-view rule of the frozen model; None: the model's own."""
     formats: Sequence[str] = FORMATS
@@ -152,8 +145,7 @@ class Job:
 
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
-        views, size = len(self.batch), self.batch.image_hw
-        plan_reconstruction(self.model, views, size, device=self.engine.device, precision=self.engine.precision)
+        plan_reconstruction(self.model, len(self.batch), self.batch.image_hw, compute=self.compute)
         frozen = None
         if self.recipe is not None:
             frozen = self._predicted(self.folder / FROZEN_FOLDER, "frozen prediction", self.reference)
@@ -176,29 +168,25 @@ class Job:
         if (folder / PREDICTION_NAME).is_file():
             return Reconstruction.load(folder)
         with self._timed(stage):
-            result = predict(
-                self.model, self.batch, reference=reference, device=self.engine.device, precision=self.engine.precision
-            )
+            result = predict(self.model, self.batch, reference=reference, compute=self.compute)
             result.save(folder)
         return result
 
     def _adapted(self) -> None:
         """Train the adapter, or continue training it, or load the finished one."""
         folder = self.folder / ADAPTER_FOLDER
-        if (folder / PAGE).is_file():
+        if (folder / METADATA).is_file():
             self.in_place = load_adapter(self.model, folder)
             return
         assert self.recipe is not None
         scene = self.scene or SceneImages.from_batch("photos", self.batch)
-        engine = planned_engine(self.model, self.batch, self.recipe, seed=self.seed, engine=self.engine, folder=folder)
         with self._timed("adaptation"):
             result = train_adapter(
-                self.model, [scene], self.recipe, seed=self.seed, engine=engine, resume_in=folder,
-                on_step=self.hooks.step,
+                self.model, [scene], self.recipe, seed=self.seed, compute=self.compute,
+                resume_in=folder, on_step=self.hooks.step,
             )  # fmt: skip
         self.in_place = result.adapter
-        save_adapter(result.adapter, folder, result.page(["photos"]))
-        (folder / STATE_FILE).unlink(missing_ok=True)
+        result.save(folder)
 
     def _export(self, final: Reconstruction) -> FilterReport | None:
         """Filter once and write all formats; None without cameras, which have no points."""
@@ -234,10 +222,10 @@ class Job:
 
     def _loss_change(self) -> dict[str, float] | None:
         """Return the mean total loss of the first and last tenth of the steps."""
-        page = self.folder / ADAPTER_FOLDER / PAGE
-        if self.recipe is None or not page.is_file():
+        metadata = self.folder / ADAPTER_FOLDER / METADATA
+        if self.recipe is None or not metadata.is_file():
             return None
-        return loss_change([terms["total"] for terms in read_json(page)["loss_curve"]])
+        return loss_change(read_json(metadata)["loss_curve"])
 
     def _timed(self, stage: str):
         return _Timed(self, stage)
@@ -255,24 +243,6 @@ class _Timed:
 
     def __exit__(self, *_) -> None:
         self.job.timings[self.stage] = time.monotonic() - self.started
-
-
-def planned_engine(
-    model: ReconstructionModel, batch: ImageBatch, recipe: Recipe, *, seed: int, engine: Engine, folder: Path
-) -> Engine:
-    """Return the engine with cache place, checkpointing and micro-batch chosen so that one scene's run fits.
-
-    On the CPU view sets go one by one, so that the result does not depend on how much memory happens to be free.
-    """
-    engine = replace(engine, cache_folder=folder)
-    chosen = choose_adaptation(model, [(len(batch), batch.image_hw)], recipe, seed=seed, engine=engine).engine
-    return replace(chosen, micro_batch=engine.micro_batch) if engine.device.type == "cpu" else chosen
-
-
-def loss_change(totals: Sequence[float]) -> dict[str, float]:
-    """Return the mean of the first and of the last tenth of a loss curve."""
-    tenth = max(1, len(totals) // 10)
-    return {"first": sum(totals[:tenth]) / tenth, "last": sum(totals[-tenth:]) / tenth}
 
 
 def versions() -> dict[str, str]:

@@ -10,9 +10,14 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.adapter_files import adapter_page, load_adapter, save_adapter
-from freegeo.adaptation.peft_files import lora_layers
-from freegeo.adaptation.published import export_published, own_names
+from freegeo.adaptation.adapter_files import (
+    adapter_metadata,
+    export_published,
+    load_adapter,
+    lora_layers,
+    own_names,
+    save_adapter,
+)
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.models.catalog import LoadedFrom, build_empty
 from tiny_models import attach, noise, outputs, same, tiny_da3, tiny_vggt, trained
@@ -20,7 +25,7 @@ from tiny_models import attach, noise, outputs, same, tiny_da3, tiny_vggt, train
 IMAGES = noise(4)
 MODELS = {"da3": tiny_da3, "vggt": tiny_vggt}
 PUBLISHED_LAYER = {"da3": "blocks.2.attn.qkv", "vggt": "aggregator.frame_blocks.0.attn.qkv"}
-PAGE = {"recipe": {"name": "scene"}, "seed": 42}
+METADATA = {"recipe": {"name": "scene"}, "seed": 42}
 
 
 @pytest.fixture(params=MODELS)
@@ -31,7 +36,7 @@ def build(request):
 def saved(build, folder: Path) -> tuple[Adapter, list[torch.Tensor]]:
     """Save a trained adapter and return it with the outputs of its model."""
     adapter = trained(build())
-    save_adapter(adapter, folder, PAGE)
+    save_adapter(adapter, folder, METADATA)
     return adapter, outputs(adapter.model, IMAGES)
 
 
@@ -51,7 +56,7 @@ def test_saved_and_loaded_is_the_same_adapter(build, tmp_path):
 
 def test_saving_twice_writes_the_same_tensors(build, tmp_path):
     saved(build, tmp_path / "one")
-    save_adapter(load_adapter(build(), tmp_path / "one"), tmp_path / "two", PAGE)
+    save_adapter(load_adapter(build(), tmp_path / "one"), tmp_path / "two", METADATA)
     for name in ("adapter_model.safetensors", "camera_token.safetensors"):
         one, two = load_file(tmp_path / "one" / name), load_file(tmp_path / "two" / name)
         assert one.keys() == two.keys()
@@ -61,10 +66,10 @@ def test_saving_twice_writes_the_same_tensors(build, tmp_path):
 def test_the_page_says_what_the_adapter_is(build, tmp_path):
     model = build()
     model.loaded_from = LoadedFrom(model=model.spec.name, file="model.safetensors", fingerprint="0123", licence="none")
-    files = save_adapter(attach(model), tmp_path, PAGE)
-    page = adapter_page(tmp_path)
+    files = save_adapter(attach(model), tmp_path, METADATA)
+    page = adapter_metadata(tmp_path)
     assert page == {
-        "format": 1, "base": {"model": model.spec.name, "fingerprint": "0123", "licence": "none"}, **PAGE
+        "format": 1, "base": {"model": model.spec.name, "fingerprint": "0123", "licence": "none"}, **METADATA
     }  # fmt: skip
     assert sorted(tmp_path.iterdir()) == sorted(files)
     config = json.loads((tmp_path / "adapter_config.json").read_text())
@@ -196,7 +201,7 @@ def test_an_adapter_of_another_model_is_refused(tmp_path):
 def test_an_adapter_of_another_checkpoint_is_refused(tmp_path):
     model = tiny_da3()
     model.loaded_from = LoadedFrom(model="tiny-da3", file="a.safetensors", fingerprint="aaaa", licence="none")
-    save_adapter(attach(model), tmp_path, PAGE)
+    save_adapter(attach(model), tmp_path, METADATA)
     other = tiny_da3(seed=5)
     other.loaded_from = LoadedFrom(model="tiny-da3", file="b.safetensors", fingerprint="bbbb", licence="none")
     refused(other, tmp_path, r"another checkpoint of tiny-da3 \(aaaa, this is bbbb\)")

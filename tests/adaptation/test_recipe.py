@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from freegeo.adaptation import recipe as recipes
-from freegeo.adaptation.trainer import learning_rate
+from freegeo.adaptation.adapt import learning_rate
 from freegeo.adaptation.views import schedule
 from freegeo.errors import UserError
 from freegeo.models.api import AdaptationDefaults, ModelSpec

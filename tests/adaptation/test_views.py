@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from freegeo.adaptation import recipe as recipes
-from freegeo.adaptation.images import released_augmentation
+from freegeo.adaptation.samples import released_augmentation
 from freegeo.adaptation.views import draw_frames, kept_positions, schedule, view_sets
 from freegeo.errors import UserError
 from tiny_models import quick, tiny_da3

@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from cli.conftest import QUICK
-from freegeo.adaptation import trainer
+from freegeo.adaptation import adapt as adapting
 from png_header import png_header
 
 
@@ -213,7 +213,7 @@ def test_adapters_that_cannot_be_used(freegeo, photo_folder, tiny, tmp_path, kin
 def test_loss_that_is_not_finite_names_its_term_and_spares_the_adapter(
     freegeo, photo_folder, tiny, tmp_path, monkeypatch
 ):
-    plain = trainer.adaptation_loss
+    plain = adapting.adaptation_loss
     adapters = []
 
     def poisoned(*arguments, **options):
@@ -225,7 +225,7 @@ def test_loss_that_is_not_finite_names_its_term_and_spares_the_adapter(
         def step(self, *arguments, **options):
             adapters.append("stepped")
 
-    monkeypatch.setattr(trainer, "adaptation_loss", poisoned)
+    monkeypatch.setattr(adapting, "adaptation_loss", poisoned)
     monkeypatch.setattr(torch.optim, "AdamW", Optimiser)
     outcome = freegeo("run", photo_folder, "-o", tmp_path / "out", *tiny, *QUICK)
     assert outcome.code == 1

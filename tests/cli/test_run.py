@@ -13,8 +13,8 @@ import trimesh
 from safetensors.numpy import load_file
 
 from cli.conftest import PHOTOS, QUICK
-from freegeo.adaptation import trainer
-from freegeo.adaptation.trainer import STATE_FILE
+from freegeo.adaptation import adapt as adapting
+from freegeo.adaptation.adapt import UNFINISHED_FILE
 from freegeo.export import formats
 from freegeo.files import LEDGER_FILE, LOCK_FILE
 from freegeo.files import STATE_FILE as RUN_FILE
@@ -221,17 +221,20 @@ def test_interrupted_run_continues_to_the_same_result(
     freegeo, finished, photo_folder, tiny, tmp_path, monkeypatch, stop_after
 ):
     out, steps = tmp_path / "out", []
-    plain = trainer._Run.step
+    losses = adapting.adaptation_loss
 
-    def step(self, number):
+    def counted(*arguments, **options):
+        steps.append(len(steps))
+        return losses(*arguments, **options)
+
+    def interrupted(*arguments, **options):
         if len(steps) == stop_after:
             raise KeyboardInterrupt
-        steps.append(number)
-        return plain(self, number)
+        return counted(*arguments, **options)
 
-    monkeypatch.setattr(trainer, "SAVE_EVERY_S", -1.0)
+    monkeypatch.setattr(adapting, "SAVE_EVERY_S", -1.0)
     with monkeypatch.context() as patch:
-        patch.setattr(trainer._Run, "step", step)
+        patch.setattr(adapting, "adaptation_loss", interrupted)
         if stop_after == 2:
             # Adaptation is complete; the interruption comes while the files are written.
             patch.setattr(formats, "export", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -241,11 +244,11 @@ def test_interrupted_run_continues_to_the_same_result(
     assert "the same command continues" in outcome.sentence()
     assert "reconstruction.json" not in files(out)
     if stop_after == 1:
-        assert (out / "adapter" / STATE_FILE).is_file()
+        assert (out / "adapter" / UNFINISHED_FILE).is_file()
     steps.clear()
-    monkeypatch.setattr(trainer._Run, "step", lambda self, number: (steps.append(number), plain(self, number))[1])
+    monkeypatch.setattr(adapting, "adaptation_loss", counted)
     assert freegeo("run", photo_folder, "-o", out, *tiny, *QUICK).code == 0
-    assert steps == ([1] if stop_after == 1 else [])
+    assert len(steps) == (1 if stop_after == 1 else 0)
     assert same(prediction(out), prediction(finished))
     assert files(out) == files(finished)
 
@@ -255,7 +258,7 @@ def test_killed_process_continues_to_the_same_result(freegeo, finished, photo_fo
     arguments = ["run", str(photo_folder), "-o", str(out), *tiny, *QUICK]
     code = f"""
 import time
-from freegeo.adaptation import trainer
+from freegeo.adaptation import adapt as adapting
 from freegeo.cli.app import main
 plain = trainer._Run.step
 def step(self, number):
@@ -267,11 +270,11 @@ main({arguments!r})
 """
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 110
-    while not (out / "adapter" / STATE_FILE).is_file() and time.monotonic() < deadline and process.poll() is None:
+    while not (out / "adapter" / UNFINISHED_FILE).is_file() and time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert (out / "adapter" / STATE_FILE).is_file()
+    assert (out / "adapter" / UNFINISHED_FILE).is_file()
     outcome = freegeo(*arguments)
     assert outcome.code == 0, outcome.err
     assert same(prediction(out), prediction(finished))

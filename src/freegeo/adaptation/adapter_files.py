@@ -1,12 +1,20 @@
-"""Adapters on disk: peft's own two files, the camera token, and a page that says what the adapter is.
+"""Adapters on disk: peft's own two files, the camera token, and what the adapter is.
 
-ADAPTER/  adapter_config.json  adapter_model.safetensors    peft's format
-          camera_token.safetensors                          where the model has a camera token
-          freegeo.json         base model and its fingerprint, recipe, seed, scenes, loss curve
+ADAPTER/  adapter_config.json         rank, alpha, target layers                                    peft's format
+          adapter_model.safetensors   base_model.model.<layer>.lora_{A|B}.weight, float32           peft's format
+          camera_token.safetensors    where the model has a camera token
+          freegeo.json                base model and its fingerprint, recipe, seed, scenes, loss curve
+
+The layout of the method's authors (docs/method.md, "Adapter files") is read and written too:
+
+FOLDER/   <name>_lora_peft/           peft's two files; layers are named relative to the part that the authors adapt,
+                                      which the model knows (`published_adapter_root`)
+          <name>_lora.pt              {"camera_token": tensor}, float32, beside the peft folder
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,20 +23,28 @@ import torch
 from torch import Tensor
 
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.peft_files import lora_layers, read_peft, write_peft
-from freegeo.adaptation.published import is_published, own_names, read_camera_token
 from freegeo.errors import UserError
-from freegeo.files import FORMAT, read_json, write_json, write_tensors
+from freegeo.files import FORMAT, atomic_path, read_json, write_json, write_tensors
 from freegeo.models.checkpoints import read_tensors, require_match
 
 if TYPE_CHECKING:
     from freegeo.models.api import ReconstructionModel
 
-TOKEN, PAGE = "camera_token.safetensors", "freegeo.json"
+TOKEN, METADATA = "camera_token.safetensors", "freegeo.json"
+PEFT_PREFIX = "base_model.model."
+CONFIG, WEIGHTS = "adapter_config.json", "adapter_model.safetensors"
+CHANGES_THE_FORMULA = (
+    *("use_rslora", "use_dora", "rank_pattern", "alpha_pattern", "modules_to_save"),
+    *("fan_in_fan_out", "layer_replication"),
+)
+"""Settings of peft under which an adapter is more than W + alpha / r * B A with one rank."""
 
 
-def save_adapter(adapter: Adapter, folder: Path, page: Mapping[str, Any]) -> list[Path]:
-    """Write an adapter at strength 1; `page` is what freegeo.json adds to the base model's identity.
+LORA_SUFFIX, TOKEN_SUFFIX = "_lora_peft", "_lora.pt"
+
+
+def save_adapter(adapter: Adapter, folder: Path, metadata: Mapping[str, Any]) -> list[Path]:
+    """Write an adapter at strength 1; `metadata` is what freegeo.json adds to the base model's identity.
 
     Returns the files.
     """
@@ -37,8 +53,8 @@ def save_adapter(adapter: Adapter, folder: Path, page: Mapping[str, Any]) -> lis
     if adapter.camera_token is not None:
         write_tensors(folder / TOKEN, {"camera_token": adapter.camera_token.float()})
         files.append(folder / TOKEN)
-    write_json(folder / PAGE, {"format": FORMAT, "base": _base(adapter.model), **page})
-    return [*files, folder / PAGE]
+    write_json(folder / METADATA, {"format": FORMAT, "base": _base(adapter.model), **metadata})
+    return [*files, folder / METADATA]
 
 
 def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
@@ -50,7 +66,7 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
     """
     folder, model = Path(folder), model.adaptable()
     config, tensors = read_peft(folder)
-    _require_same_base(model, adapter_page(folder), folder)
+    _require_same_base(model, adapter_metadata(folder), folder)
     tensors = own_names(model, tensors) | _camera_token(model, folder)
     adapter = Adapter.attach(
         model,
@@ -75,9 +91,9 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
     return adapter
 
 
-def adapter_page(folder: Path) -> dict[str, Any] | None:
+def adapter_metadata(folder: Path) -> dict[str, Any] | None:
     """Return freegeo.json of an adapter folder; None for an adapter that freegeo did not write."""
-    return read_json(folder / PAGE) if (folder / PAGE).is_file() else None
+    return read_json(folder / METADATA) if (folder / METADATA).is_file() else None
 
 
 def _camera_token(model: ReconstructionModel, folder: Path) -> dict[str, Tensor]:
@@ -98,12 +114,12 @@ def _base(model: ReconstructionModel) -> dict[str, str]:
     }
 
 
-def _require_same_base(model: ReconstructionModel, page: Mapping[str, Any] | None, folder: Path) -> None:
-    if page is None:
+def _require_same_base(model: ReconstructionModel, metadata: Mapping[str, Any] | None, folder: Path) -> None:
+    if metadata is None:
         return
-    if page["format"] > FORMAT:
-        raise UserError(f"{folder}: written by a newer freegeo (format {page['format']}). Update freegeo.")
-    base, mine = page["base"], _base(model)
+    if metadata["format"] > FORMAT:
+        raise UserError(f"{folder}: written by a newer freegeo (format {metadata['format']}). Update freegeo.")
+    base, mine = metadata["base"], _base(model)
     if base["model"] != mine["model"]:
         raise UserError(f"{folder}: the adapter was made for {base['model']}, not for {mine['model']}. Use that model.")
     if base["fingerprint"] and mine["fingerprint"] and base["fingerprint"] != mine["fingerprint"]:
@@ -111,3 +127,91 @@ def _require_same_base(model: ReconstructionModel, page: Mapping[str, Any] | Non
             f"{folder}: the adapter was made for another checkpoint of {base['model']} ({base['fingerprint']}, this is "
             f"{mine['fingerprint']}). Use that checkpoint."
         )
+
+
+def write_peft(adapter: Adapter, folder: Path, *, root: str = "") -> list[Path]:
+    """Write the LoRA part of an adapter, its layers named relative to the module `root` of the model."""
+    prefix = f"{root}." if root else ""
+    named = {name: value for name, value in adapter.named_parameters().items() if name != "camera_token"}
+    tensors = {PEFT_PREFIX + name.removeprefix(prefix): value.float() for name, value in named.items()}
+    write_tensors(folder / WEIGHTS, tensors, {"format": "pt"})
+    values = adapter.lora_config.to_dict()
+    values["target_modules"] = sorted(name.removeprefix(prefix) for name in adapter.layers)
+    values["inference_mode"] = True
+    values["base_model_name_or_path"] = adapter.model.spec.name
+    with atomic_path(folder / CONFIG) as part:
+        part.write_text(json.dumps(values, indent=2, sort_keys=True, default=_plain) + "\n", encoding="utf-8")
+    return [folder / CONFIG, folder / WEIGHTS]
+
+
+def read_peft(folder: Path) -> tuple[Mapping[str, Any], dict[str, Tensor]]:
+    """Return an adapter's configuration and its tensors `<layer>.lora_{A|B}.weight`.
+
+    UserError when the folder holds no LoRA adapter, or one that computes something else than plain LoRA does.
+    """
+    if not (folder / CONFIG).is_file() or not (folder / WEIGHTS).is_file():
+        raise UserError(
+            f"{folder}: not an adapter folder ({CONFIG} and {WEIGHTS} are expected). "
+            "Give the folder that `freegeo adapt` wrote."
+        )
+    config = read_json(folder / CONFIG)
+    if config.get("peft_type") != "LORA" or not {"r", "lora_alpha"} <= set(config):
+        raise UserError(f"{folder}: holds a {config.get('peft_type')} adapter; only LoRA is supported.")
+    special = [name for name in CHANGES_THE_FORMULA if config.get(name)]
+    if special:
+        raise UserError(f"{folder}: the adapter uses {', '.join(special)}; only plain LoRA of one rank is supported.")
+    tensors = {name.removeprefix(PEFT_PREFIX): value for name, value in read_tensors(folder / WEIGHTS).items()}
+    if not lora_layers(tensors):
+        raise UserError(f"{folder / WEIGHTS}: no LoRA matrices in it. Give the folder that `freegeo adapt` wrote.")
+    return config, tensors
+
+
+def lora_layers(tensors: Mapping[str, Tensor]) -> list[str]:
+    """Return the layers that LoRA matrices belong to, sorted."""
+    return sorted({name.rsplit(".lora_", 1)[0] for name in tensors if ".lora_" in name})
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, set | frozenset):
+        return sorted(value)
+    return str(getattr(value, "value", value))
+
+
+def own_names(model: ReconstructionModel, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Name LoRA tensors by the layers of the whole model, where a file names them by those of the adapted part."""
+    root = model.published_adapter_root
+    modules = {name for name, _ in model.named_modules()}
+    if not root or any(f"{root}.{layer}" not in modules for layer in lora_layers(tensors)):
+        return dict(tensors)
+    return {f"{root}.{name}": value for name, value in tensors.items()}
+
+
+def is_published(folder: Path) -> bool:
+    """Say whether a folder is the peft half of a published adapter, by its name."""
+    return folder.absolute().name.endswith(LORA_SUFFIX)
+
+
+def read_camera_token(folder: Path) -> Tensor:
+    """Read the camera token that belongs to a published peft folder; nothing in the file is executed.
+
+    UserError when the file is missing or holds something else.
+    """
+    folder = folder.absolute()
+    path = folder.with_name(folder.name.removesuffix(LORA_SUFFIX) + TOKEN_SUFFIX)
+    if not path.is_file():
+        raise UserError(f"{path}: the camera token of {folder.name} is missing. Copy that file beside the folder.")
+    tensors = read_tensors(path)
+    if set(tensors) != {"camera_token"}:
+        raise UserError(f"{path}: expected only camera_token, found {', '.join(sorted(tensors)) or 'nothing'}.")
+    return tensors["camera_token"]
+
+
+def export_published(adapter: Adapter, folder: Path, name: str = "latest") -> list[Path]:
+    """Write an adapter in the authors' layout into `folder`, as `name`; returns the files."""
+    files = write_peft(adapter, folder / (name + LORA_SUFFIX), root=adapter.model.published_adapter_root)
+    if adapter.camera_token is None:
+        return files
+    token = folder / (name + TOKEN_SUFFIX)
+    with atomic_path(token) as part:
+        torch.save({"camera_token": adapter.camera_token.detach().float().cpu().clone()}, part)
+    return [*files, token]

@@ -21,18 +21,18 @@ from typing import Any
 
 import torch
 
+from freegeo.adaptation.adapt import Adapted, Progress, adapt, remove_state
 from freegeo.adaptation.adapter import Adapter, count_trainable
 from freegeo.adaptation.adapter_files import load_adapter, save_adapter
-from freegeo.adaptation.engine import Engine
-from freegeo.adaptation.images import SceneImages
 from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
-from freegeo.adaptation.trainer import STATE_FILE, Adapted, Progress, adapt
+from freegeo.adaptation.samples import SceneImages
 from freegeo.adaptation.views import schedule
 from freegeo.benchmark.tasks import DAMAGED, Problem, plain, reason_of
 from freegeo.data.datasets.registry import load_scene
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import read_json, write_json
 from freegeo.models.api import ReconstructionModel
+from freegeo.models.precision import Compute
 
 logger = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ def train(
     model: ReconstructionModel,
     data: Path,
     out: Path,
-    engine: Engine,
+    compute: Compute,
     on_step: Callable[[Progress], None] = lambda progress: None,
 ) -> list[Problem]:
     """Train an adapter, or continue, and keep it after every epoch; the model is left as it was.
@@ -100,13 +100,13 @@ def train(
         page = {"epoch": epoch, "scenes": [scene.name for scene in scenes], "configuration": job.configuration()}
         save_adapter(adapter, epoch_folder(job, out, epoch), page)
 
-    reset_peak_memory(engine.device)
+    reset_peak_memory(compute.device)
     result = adapt(
-        model, scenes, job.recipe, seed=job.seed, engine=engine, resume_in=folder, on_step=on_step, on_epoch=keep
+        model, scenes, job.recipe, seed=job.seed, compute=compute, resume_in=folder, on_step=on_step, on_epoch=keep
     )
     result.adapter.detach()
-    (folder / STATE_FILE).unlink(missing_ok=True)
-    facts = _facts(result, model, job.recipe, peak_memory_gb(engine.device))
+    remove_state(folder)
+    facts = _facts(result, model, job.recipe, peak_memory_gb(compute.device))
     write_json(folder / FINISHED, {**facts, "left_out": [asdict(problem) for problem in problems]})
     return problems
 
@@ -170,13 +170,12 @@ def _usable_scenes(job: AdapterJob, model: ReconstructionModel, data: Path) -> t
 
 
 def _facts(result: Adapted, model: ReconstructionModel, recipe: Recipe, peak_gb: float) -> dict[str, float]:
-    totals = [terms["total"] for terms in result.curve]
-    tenth = max(1, len(totals) // 10)
+    change = result.loss_change()
     return {
-        "steps": len(totals),
+        "steps": len(result.curve),
         "seconds": round(result.seconds, 2),
         "peak_gb": round(peak_gb, 3),
         "trainable": count_trainable(model, recipe.rank),
-        "first_loss": sum(totals[:tenth]) / tenth,
-        "last_loss": sum(totals[-tenth:]) / tenth,
+        "first_loss": change["first"],
+        "last_loss": change["last"],
     }

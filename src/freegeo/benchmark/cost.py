@@ -10,9 +10,9 @@ from pathlib import Path
 
 import torch
 
-from freegeo.adaptation.images import SceneImages
+from freegeo.adaptation.adapt import adapt
 from freegeo.adaptation.recipe import Recipe
-from freegeo.adaptation.trainer import adapt
+from freegeo.adaptation.samples import SceneImages
 from freegeo.benchmark.paper.variants import variant
 from freegeo.benchmark.predict import Predictor
 from freegeo.benchmark.tasks import DAMAGED, SAMPLE, Task
@@ -67,7 +67,7 @@ def estimate(predictor: Predictor, tasks: Sequence[Task]) -> Cost:
     if jobs:
         steps = sum(job.steps([SAMPLE * 2] * len(job.scenes)) for job in jobs)
         noise = predictor.noise(SAMPLE)
-        scene = SceneImages(name="noise", count=SAMPLE, load=lambda frames: noise[list(frames)], in_memory=True)
+        scene = SceneImages(name="noise", count=SAMPLE, load=lambda frames: noise[list(frames)])
         seconds_of_step = _seconds_of_step(predictor, scene, jobs[0].recipe.changed(steps=MEASURED_STEPS))
     return Cost(
         passes=passes, seconds_of_pass=seconds, adapters=len(jobs), steps=steps, seconds_of_step=seconds_of_step
@@ -148,7 +148,8 @@ def _seconds_of_step(predictor: Predictor, scene: SceneImages, recipe: Recipe) -
     """Mean duration of the steps after the first, which also pays for what is done once."""
     times: list[float] = []
     result = adapt(
-        predictor.model, [scene], recipe, engine=predictor.engine, on_step=lambda _: times.append(time.perf_counter())
-    )
+        predictor.model, [scene], recipe, seed=predictor.setup.adapt_seed, compute=predictor.compute,
+        on_step=lambda _: times.append(time.perf_counter()),
+    )  # fmt: skip
     result.adapter.detach()
     return (times[-1] - times[0]) / (len(times) - 1)

@@ -15,11 +15,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from freegeo.adaptation import recipe as recipes
+from freegeo.adaptation.adapt import Progress
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.bank import embed_in_chunks
-from freegeo.adaptation.engine import Engine
 from freegeo.adaptation.recipe import Recipe
-from freegeo.adaptation.trainer import Progress
 from freegeo.benchmark.adapters import AdapterJob, peak_memory_gb, reset_peak_memory, train, use
 from freegeo.benchmark.frames import require_truth
 from freegeo.benchmark.paper.variants import Variant, variant
@@ -43,9 +41,9 @@ from freegeo.errors import UserError
 from freegeo.files import write_json
 from freegeo.geometry import se3
 from freegeo.geometry.camera import resize_K
-from freegeo.models.api import ReconstructionModel
+from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import load_model
-from freegeo.models.precision import Precision, autocast, choose_device, choose_precision
+from freegeo.models.precision import Compute, Precision
 from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
 
 AdaptPer = Literal["dataset", "scene"]
@@ -81,8 +79,7 @@ class Predictor:
 
     def __init__(self, setup: Setup):
         self.setup = setup
-        device = choose_device(setup.device)
-        self.engine = Engine(device=device, precision=choose_precision(setup.precision, device))
+        self.compute = Compute.choose(setup.device, setup.precision)
         self._in_place: tuple[str, Adapter] | None = None
         self._load = lru_cache(maxsize=8)(partial(load_scene, setup.data))
 
@@ -90,7 +87,7 @@ class Predictor:
     def model(self) -> ReconstructionModel:
         """The model, loaded on first use."""
         model = load_model(self.setup.model, checkpoint=self.setup.checkpoint)
-        return model.to(self.engine.device).eval()
+        return model.to(self.compute.device).eval()
 
     def configuration(self, task: Task) -> dict[str, Any]:
         """Everything but the task itself that decides its prediction."""
@@ -130,7 +127,7 @@ class Predictor:
     def adapt(self, job: AdapterJob, on_step: Callable[[Progress], None] = lambda progress: None) -> list[Problem]:
         """Train one adapter; returns the scenes that had to be left out."""
         self._take_off()
-        return train(job, self.model, self.setup.data, self.setup.out, self.engine, on_step)
+        return train(job, self.model, self.setup.data, self.setup.out, self.compute, on_step)
 
     def predict(self, task: Task) -> None:
         """Carry out one task and store its outcome."""
@@ -138,7 +135,7 @@ class Predictor:
         kind = variant(task.variant)
         job = self.adapter_job(task)
         self._put_on(job)
-        reset_peak_memory(self.engine.device)
+        reset_peak_memory(self.compute.device)
         facts: dict[str, Any] = {"adapter": None if job is None else job.digest}
         if kind.measures == "features":
             frames, values = self._feature_distance(scene, task)
@@ -146,7 +143,7 @@ class Predictor:
         else:
             started = time.perf_counter()
             frames, prediction = self._prediction(scene, task, kind)
-            facts |= {"seconds": time.perf_counter() - started, "peak_gb": peak_memory_gb(self.engine.device)}
+            facts |= {"seconds": time.perf_counter() - started, "peak_gb": peak_memory_gb(self.compute.device)}
             write_stored(task, self.setup.out, prediction, frames)
         finish(task, self.setup.out, self.configuration(task), frames=frames, **facts)
 
@@ -161,8 +158,8 @@ class Predictor:
     @torch.no_grad()
     def forward(self, images: Tensor) -> Prediction:
         """One whole pass over images (S, 3, H, W) with the model as it stands."""
-        with self._arithmetic():
-            tokens = embed_in_chunks(self.model, images, device=self.engine.device)
+        with self.compute.autocast():
+            tokens = embed_in_chunks(self.model, images, device=self.compute.device)
             return self.model.decode(self._features(tokens))
 
     def close(self) -> None:
@@ -179,7 +176,7 @@ class Predictor:
         else:
             frames = choose_frames(task.rule, len(scene), task.views, task.seed)
             features = self._features(*self._read(scene, frames))
-        with self._arithmetic():
+        with self.compute.autocast():
             found = self.model.decode(features)
         return frames, found.map(lambda tensor: tensor[0].float().cpu())
 
@@ -203,25 +200,22 @@ class Predictor:
         """The embedded frames, and their true cameras as the model takes them when the run gives them away."""
         chosen = scene.select(frames)
         batch = self.model.preprocess(list(chosen.photos))
-        with self._arithmetic():
-            tokens = embed_in_chunks(self.model, batch.images, device=self.engine.device)
+        with self.compute.autocast():
+            tokens = embed_in_chunks(self.model, batch.images, device=self.compute.device)
         if not self.setup.given_cameras:
             return tokens, None
-        return tokens, true_cameras(chosen, batch).to(self.engine.device)
+        return tokens, true_cameras(chosen, batch).to(self.compute.device)
 
     def _features(self, tokens: ViewTokens, cameras: Cameras | None = None) -> Features:
-        with self._arithmetic():
+        with self.compute.autocast():
             return self.model.aggregate(tokens, reference="first", cameras=cameras)
-
-    def _arithmetic(self):
-        return autocast(self.engine.device, self.engine.precision)
 
     def _base(self) -> dict[str, Any]:
         loaded = self.model.loaded_from
         return {
             "model": self.setup.model,
             "checkpoint": loaded.fingerprint if loaded else None,
-            "precision": self.engine.precision,
+            "precision": self.compute.precision,
             **({"given_cameras": True} if self.setup.given_cameras else {}),
         }
 

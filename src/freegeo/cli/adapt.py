@@ -11,8 +11,8 @@ from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, Recip
 from freegeo.cli.sources import load_source, split_scenes
 
 if TYPE_CHECKING:
-    from freegeo.adaptation.bank import SceneImages
     from freegeo.adaptation.recipe import Recipe
+    from freegeo.adaptation.samples import SceneImages
     from freegeo.models.api import ReconstructionModel
 
 DEFAULT_RECIPE, DEFAULT_MODEL, DEFAULT_PHOTOS = RecipeOptions(), ModelOptions(), PhotoOptions()
@@ -43,7 +43,7 @@ def adapt(
     published
         Also write the adapter in the layout of the authors' release, below `published`.
     """
-    from freegeo.adaptation.bank import SceneImages
+    from freegeo.adaptation.samples import SceneImages
     from freegeo.pipeline import require_enough_photos, settings_of
     from freegeo.run_folder import check_folder, run_folder
 
@@ -78,28 +78,22 @@ def _train(
     *,
     published: bool,
 ) -> None:
-    from freegeo.adaptation.adapter_files import save_adapter
-    from freegeo.adaptation.published import export_published
-    from freegeo.adaptation.trainer import STATE_FILE
-    from freegeo.adaptation.trainer import adapt as train_adapter
-    from freegeo.pipeline import loss_change
-
-    names = [scene.name for scene in images]
+    from freegeo.adaptation.adapt import adapt as train_adapter
+    from freegeo.adaptation.adapter_files import export_published, save_adapter
 
     def keep_epoch(epoch: int, adapter) -> None:
         if plan.epochs is not None:
-            page = {"epoch": epoch, "scenes": names, "seed": model.seed}
-            save_adapter(adapter, folder / "epochs" / f"epoch_{epoch}", page)
+            about = {"epoch": epoch, "scenes": [scene.name for scene in images], "seed": model.seed}
+            save_adapter(adapter, folder / "epochs" / f"epoch_{epoch}", about)
 
     with progress_hooks() as hooks:
         result = train_adapter(
-            loaded, images, plan, seed=model.seed, engine=model.engine(), resume_in=folder, on_step=hooks.step,
+            loaded, images, plan, seed=model.seed, compute=model.compute(), resume_in=folder, on_step=hooks.step,
             on_epoch=keep_epoch,
         )  # fmt: skip
-    save_adapter(result.adapter, folder, result.page(names))
+    result.save(folder)
     if published:
         export_published(result.adapter, folder / "published")
-    (folder / STATE_FILE).unlink(missing_ok=True)
-    change = loss_change([terms["total"] for terms in result.curve])
+    change = result.loss_change()
     console.say(f"adaptation loss {change['first']:.4f} -> {change['last']:.4f} in {result.seconds:.0f} s")
     console.say(f"licence of the weights: {loaded.spec.weights_licence}")

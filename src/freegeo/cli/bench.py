@@ -272,7 +272,7 @@ def _predict(
         return []
     for line in estimate(predictor, waiting).lines():
         console.say(f"  {line}")
-    for cost in estimate_scoring(bench.data, waiting, device=predictor.engine.device):
+    for cost in estimate_scoring(bench.data, waiting, device=predictor.compute.device):
         console.say(f"  {cost.line()}")
     if estimate_only:
         return []

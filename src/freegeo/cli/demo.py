@@ -95,10 +95,7 @@ def mean_score(job: Job, scene: Scene, views: int) -> dict[str, float]:
 
     rows = []
     for frames in windows(len(scene), views):
-        found = predict(
-            job.model, job.batch.select(frames), reference="first", device=job.engine.device,
-            precision=job.engine.precision,
-        )  # fmt: skip
+        found = predict(job.model, job.batch.select(frames), reference="first", compute=job.compute)
         rows.append(evaluate(found, scene.select(frames)))
     return {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
 

@@ -13,8 +13,8 @@ from freegeo.cli.options import ModelOptions, OutputOptions
 from freegeo.run_folder import check_folder, run_folder
 
 if TYPE_CHECKING:
-    from freegeo.adaptation.images import SceneImages
     from freegeo.adaptation.recipe import Recipe
+    from freegeo.adaptation.samples import SceneImages
     from freegeo.models.api import ReconstructionModel
     from freegeo.pipeline import Hooks, Job
     from freegeo.types import PhotoLike
@@ -104,7 +104,7 @@ def run_job(
         save_frames([photo for photo in photos if isinstance(photo, VideoFrame)], folder / FRAMES_FOLDER)
         job = Job(
             model=model, batch=batch, folder=folder, recipe=recipe, adapter=adapter, seed=model_options.seed,
-            engine=model_options.engine(), hooks=hooks, reference=model_options.reference,
+            compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), after=after, formats=files.formats, filters=files.filters.settings(),
             masks=masks, scene=squashed_scene(photos, model, recipe),
         )  # fmt: skip
@@ -115,7 +115,7 @@ def squashed_scene(
     photos: Sequence[PhotoLike], model: ReconstructionModel, recipe: Recipe | None
 ) -> SceneImages | None:
     """Return the images of a recipe that has its own way to resize them."""
-    from freegeo.adaptation.images import SceneImages
+    from freegeo.adaptation.samples import SceneImages
 
     if recipe is None or recipe.squash is None:
         return None
@@ -137,7 +137,7 @@ def save_frames(photos: Sequence[PhotoLike], folder: Path) -> None:
 
 def adapter_identity(folder: Path) -> dict[str, str]:
     """Return what tells an adapter from another one; UserError when the folder holds none."""
-    from freegeo.adaptation.peft_files import WEIGHTS, read_peft
+    from freegeo.adaptation.adapter_files import WEIGHTS, read_peft
     from freegeo.models.checkpoints import fingerprint
 
     read_peft(folder)

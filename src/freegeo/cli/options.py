@@ -15,8 +15,8 @@ SMALL_MODEL = 20_000_000
 
 if TYPE_CHECKING:
     from freegeo.adaptation.recipe import Recipe
-    from freegeo.adaptation.trainer import Engine
     from freegeo.models.api import ModelSpec, ReconstructionModel
+    from freegeo.models.precision import Compute
 
 
 @Parameter(name="*")
@@ -45,13 +45,11 @@ class ModelOptions:
         use_few_threads(model)
         return model
 
-    def engine(self) -> Engine:
-        """Return how adaptation and reconstruction are computed."""
-        from freegeo.adaptation.trainer import Engine
-        from freegeo.models.precision import choose_device, choose_precision
+    def compute(self) -> Compute:
+        """Return where adaptation and reconstruction run, and in which precision."""
+        from freegeo.models.precision import Compute
 
-        device = choose_device(self.device)
-        return Engine(device=device, precision=choose_precision(self.precision, device))
+        return Compute.choose(self.device, self.precision)
 
     def settings(self, model: ReconstructionModel) -> dict[str, object]:
         """Return what the result depends on, for comparison with an existing folder."""
@@ -59,7 +57,7 @@ class ModelOptions:
         return {
             "model": self.model,
             "checkpoint": loaded.fingerprint if loaded else None,
-            "precision": self.engine().precision,
+            "precision": self.compute().precision,
             "seed": self.seed,
             "reference": self.reference or model.spec.reference,
         }

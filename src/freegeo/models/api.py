@@ -11,6 +11,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+import torch
 from torch import Tensor, nn
 
 from freegeo.errors import UserError
@@ -129,3 +130,21 @@ def level_tokens(features: Features, layers: Collection[int], model: str) -> lis
             "Call aggregate without `layers`, or with all of them."
         )
     return [features.levels[layer] for layer in layers]
+
+
+@torch.no_grad()
+def embed_in_chunks(
+    model: ReconstructionModel, images: Tensor, *, device: torch.device, layers: Sequence[int] | None = None
+) -> ViewTokens:
+    """Embed images (S, 3, H, W) a few at a time, so that memory does not grow with S except for the result.
+
+    On the CPU one at a time: then a view's tokens do not depend, in the last bit, on the views beside it.
+    """
+    chunk = views_per_chunk(device)
+    parts = [model.embed(part.to(device)[None], layers=layers) for part in images.split(chunk)]
+    return ViewTokens.join_views(parts)
+
+
+def views_per_chunk(device: torch.device) -> int:
+    """Return how many views are embedded together."""
+    return 1 if device.type == "cpu" else 8

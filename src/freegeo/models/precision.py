@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -16,6 +17,27 @@ if TYPE_CHECKING:
 Precision = Literal["fp32", "bf16", "fp16"]
 PRECISIONS: tuple[Precision, ...] = ("fp32", "bf16", "fp16")
 _DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
+
+
+CPU = torch.device("cpu")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compute:
+    """Where a model runs and in which precision."""
+
+    device: torch.device = CPU
+    precision: Precision = "fp32"
+
+    def autocast(self) -> AbstractContextManager:
+        """Return the context that a model's embed and aggregate run in."""
+        return autocast(self.device, self.precision)
+
+    @classmethod
+    def choose(cls, device: str | None, precision: str | None) -> Compute:
+        """Return the device and precision asked for, or the best at hand."""
+        chosen = choose_device(device)
+        return cls(device=chosen, precision=choose_precision(precision, chosen))
 
 
 def choose_device(name: str | None) -> torch.device:

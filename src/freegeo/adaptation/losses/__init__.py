@@ -8,7 +8,7 @@ from freegeo.adaptation.losses.assemble import adaptation_loss, feature_distance
 from freegeo.adaptation.losses.config import LossConfig, paper_loss, released_da3_loss, released_vggt_loss
 from freegeo.adaptation.losses.divergence import Precision, choose_precision
 from freegeo.adaptation.losses.sampling import StepDraws, TokenDraw, draw_tokens
-from freegeo.adaptation.losses.targets import AnchorFeatures, TeacherTargets, anchor_features, teacher_targets
+from freegeo.adaptation.losses.targets import AnchorFeatures, TeacherTargets, held_out_tokens, teacher_targets
 
 __all__ = [
     "AnchorFeatures",
@@ -18,10 +18,10 @@ __all__ = [
     "TeacherTargets",
     "TokenDraw",
     "adaptation_loss",
-    "anchor_features",
     "choose_precision",
     "draw_tokens",
     "feature_distance",
+    "held_out_tokens",
     "paper_loss",
     "released_da3_loss",
     "released_vggt_loss",

@@ -1,0 +1,340 @@
+"""Adaptation: the paper's Algorithm 1 as a loop that can be stopped and continued at any step.
+
+Reading order: `adapt` (what a run is), `_train` (the loop), `_learn` (one view set), `_State` (what is saved).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import math
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from freegeo.adaptation.adapter import Adapter
+from freegeo.adaptation.adapter_files import save_adapter
+from freegeo.adaptation.losses import adaptation_loss, feature_distance, require_finite
+from freegeo.adaptation.memory import Plan, plan_adaptation
+from freegeo.adaptation.recipe import Recipe
+from freegeo.adaptation.samples import Sample, Samples, SceneImages, loss_features, targets_of
+from freegeo.adaptation.views import Visit, schedule
+from freegeo.errors import FreeGeoError, UserError
+from freegeo.files import write_tensors
+from freegeo.models.api import ReconstructionModel
+from freegeo.models.precision import Compute
+
+logger = logging.getLogger(__name__)
+
+SAVE_EVERY_S = 30.0
+UNFINISHED_FILE = "adapting.safetensors"
+"""State of an unfinished run."""
+CPU = Compute()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """Handed to the caller after every step."""
+
+    step: int
+    steps: int
+    epoch: int
+    terms: dict[str, Tensor]
+    """Loss terms of the step, detached; reading one waits for the device."""
+
+
+@dataclass
+class Adapted:
+    """A trained adapter, still in place on its model, and how it came about."""
+
+    adapter: Adapter
+    recipe: Recipe
+    seed: int
+    scenes: tuple[str, ...]
+    curve: list[dict[str, float]] = field(default_factory=list)
+    """Loss terms of every step."""
+    seconds: float = 0.0
+
+    def metadata(self) -> dict[str, Any]:
+        """Return what freegeo.json says of the run."""
+        return {
+            "recipe": asdict(self.recipe),
+            "seed": self.seed,
+            "scenes": list(self.scenes),
+            "loss_curve": self.curve,
+            "seconds": round(self.seconds, 2),
+        }
+
+    def save(self, folder: Path) -> None:
+        """Write the adapter, and remove the state of the run from the folder."""
+        save_adapter(self.adapter, folder, self.metadata())
+        remove_state(folder)
+
+    def loss_change(self) -> dict[str, float]:
+        """Return the mean total loss of the first and of the last tenth of the steps."""
+        return loss_change(self.curve)
+
+
+def loss_change(curve: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the mean total of the first and of the last tenth of a loss curve."""
+    totals = [terms["total"] for terms in curve]
+    tenth = max(1, len(totals) // 10)
+    return {"first": sum(totals[:tenth]) / tenth, "last": sum(totals[-tenth:]) / tenth}
+
+
+def learning_rate(step: int, steps: int, recipe: Recipe) -> float:
+    """Return the rate of a step: linear warm-up from 1 %, then cosine (docs/method.md, "Schedule and optimiser")."""
+    warm = int(recipe.warmup * steps)
+    if step < warm:
+        return recipe.lr * (0.01 + 0.99 * step / warm)
+    turned = 0.5 * (1 + math.cos(math.pi * (step - warm) / (steps - warm)))
+    return recipe.final_lr + (recipe.lr - recipe.final_lr) * turned
+
+
+def adapt(
+    model: ReconstructionModel,
+    scenes: Sequence[SceneImages],
+    recipe: Recipe,
+    *,
+    seed: int,
+    compute: Compute = CPU,
+    plan: Plan | None = None,
+    resume_in: Path | None = None,
+    on_step: Callable[[Progress], None] = lambda progress: None,
+    on_epoch: Callable[[int, Adapter], None] = lambda epoch, adapter: None,
+) -> Adapted:
+    """Train an adapter on the scenes' images; it stays in place on the model, on.
+
+    Args:
+        model: moved to the device of `compute`; left without an adapter when anything fails.
+        scenes: at least 3 images each.
+        recipe: everything that decides the result, with `seed`.
+        seed: of the adapter's start, the order of view sets, token draws and dropout.
+        compute: device and precision.
+        plan: where samples wait and whether activations are computed twice; None: the fastest way that fits.
+        resume_in: folder for the state of an unfinished run: the same call continues it, and on the CPU ends with the
+            same tensors.
+        on_step: called after every step.
+        on_epoch: called after every epoch with its number and the adapter.
+
+    Raises:
+        UserError: scenes that are too small, a state of another run, or a run that does not fit into memory.
+        FreeGeoError: a loss or gradient that is not finite, or memory that ran out all the same.
+    """
+    steps = schedule([scene.count for scene in scenes], recipe, seed)
+    plan = plan or plan_adaptation(model, scenes, recipe, steps, compute=compute)
+    run = _Run(model.adaptable(), scenes, recipe, steps, seed, compute, resume_in, on_step, on_epoch)
+    try:
+        return _train(run, plan)
+    except torch.OutOfMemoryError:
+        if plan.checkpointing and plan.place == "disk":
+            raise FreeGeoError(
+                f"{compute.device} ran out of memory even with activation checkpointing and teacher features on disk. "
+                "Use smaller images, fewer --views, --precision bf16 or a smaller model."
+            ) from None
+    # Here the tensors of the failed run are gone.
+    logger.warning(
+        "%s ran out of memory: once more with activation checkpointing and teacher features on disk", compute.device
+    )
+    smallest = Plan(checkpointing=True, place="disk")
+    return adapt(
+        model, scenes, recipe, seed=seed, compute=compute, plan=smallest, resume_in=resume_in, on_step=on_step,
+        on_epoch=on_epoch,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What a caller asked for."""
+
+    model: ReconstructionModel
+    scenes: Sequence[SceneImages]
+    recipe: Recipe
+    steps: Sequence[Sequence[Visit]]
+    seed: int
+    compute: Compute
+    folder: Path | None
+    on_step: Callable[[Progress], None]
+    on_epoch: Callable[[int, Adapter], None]
+
+
+def _train(run: _Run, plan: Plan) -> Adapted:
+    """Algorithm 1: per step, compare the student with the frozen teacher on every view set and update the adapter."""
+    started, recipe, steps = time.monotonic(), run.recipe, run.steps
+    model = run.model.to(run.compute.device)
+    adapter = Adapter.attach(
+        model, rank=recipe.rank, alpha=recipe.alpha, dropout=recipe.dropout,
+        generator=torch.Generator().manual_seed(run.seed),
+    )  # fmt: skip
+    result = Adapted(adapter=adapter, recipe=recipe, seed=run.seed, scenes=tuple(scene.name for scene in run.scenes))
+    with ExitStack() as undo:
+        undo.callback(adapter.detach)
+        state = _State(run, result)
+        samples = Samples(
+            adapter, run.scenes, recipe, steps[state.next_step :], compute=run.compute, place=plan.place,
+            folder=run.folder, seed=run.seed,
+        )  # fmt: skip
+        undo.callback(samples.close)
+        saved_at = time.monotonic()
+        for step in range(state.next_step, len(steps)):
+            state.optimiser.zero_grad(set_to_none=True)
+            with _training(run, plan, step):
+                parts = [_learn(run, adapter, visit, samples.take(visit), state.scaler) for visit in steps[step]]
+            terms = {name: torch.stack([part[name] for part in parts]).sum() for name in parts[0]}
+            state.update(step, terms)
+            epoch = steps[step][0].epoch
+            run.on_step(Progress(step=step, steps=len(steps), epoch=epoch, terms=terms))
+            if step + 1 == len(steps) or steps[step + 1][0].epoch != epoch:
+                state.read_terms()
+                run.on_epoch(epoch, adapter)
+            if run.folder is not None and time.monotonic() - saved_at > SAVE_EVERY_S:
+                state.save(step + 1, seconds=result.seconds + time.monotonic() - started)
+                saved_at = time.monotonic()
+        undo.pop_all()
+        samples.close()
+    result.seconds += time.monotonic() - started
+    return result
+
+
+def _learn(
+    run: _Run, adapter: Adapter, visit: Visit, sample: Sample, scaler: torch.amp.GradScaler
+) -> dict[str, Tensor]:
+    """Add the gradients of one view set, and return its share of the step's loss terms."""
+    recipe, share = run.recipe, 1 / len(run.steps[visit.step])
+    targets, draws = targets_of(sample, visit, recipe.loss, seed=run.seed)
+    with run.compute.autocast():
+        student = loss_features(adapter.model, sample.student()[0])
+    loss, terms = adaptation_loss(student.levels, targets, draws, recipe.loss, precision=sample.form)
+    scaler.scale(loss * share).backward()
+    if recipe.hold:
+        # Not in the paper: with all views the adapted features shall stay where the frozen ones are.
+        del student, loss
+        with run.compute.autocast():
+            adapted = loss_features(adapter.model, sample.tokens)
+        held = recipe.hold * feature_distance(adapted.levels, sample.teacher.levels, recipe.loss)[0]
+        scaler.scale(held * share).backward()
+        terms = {**terms, "hold": held.detach(), "total": terms["total"] + held.detach()}
+    return {name: term * share for name, term in terms.items()}
+
+
+@contextmanager
+def _training(run: _Run, plan: Plan, step: int) -> Generator[None]:
+    """Dropout on, seeded by the step so that a continued run draws the same masks; checkpointing as planned."""
+    model, device = run.model, run.compute.device
+    model.train(run.recipe.dropout > 0)
+    model.set_recompute(plan.checkpointing)
+    try:
+        with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+            torch.manual_seed(run.seed * 1_000_003 + step)
+            yield
+    finally:
+        model.eval()
+        model.set_recompute(False)
+
+
+class _State:
+    """What changes from step to step: the adapter, its optimiser, the loss curve; saved and taken up again."""
+
+    def __init__(self, run: _Run, result: Adapted):
+        self.run, self.result = run, result
+        self.parameters = result.adapter.parameters()
+        self.optimiser = torch.optim.AdamW(self.parameters, lr=0.0, weight_decay=run.recipe.weight_decay, fused=True)
+        self.scaler = torch.amp.GradScaler(run.compute.device.type, enabled=run.compute.precision == "fp16")
+        self.unread: list[tuple[int, dict[str, Tensor]]] = []
+        self.next_step = self._restore()
+
+    def update(self, step: int, terms: dict[str, Tensor]) -> None:
+        """Clip the gradients and take an optimiser step, unless the loss or the gradient is seen not to be finite.
+
+        Reading a number from an accelerator would make it wait, so there it is read later, by `read_terms`.
+        """
+        recipe = self.run.recipe
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate(step, len(self.run.steps), recipe)
+        self.scaler.unscale_(self.optimiser)
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, recipe.clip)
+        # The scaler meets gradients that overflow by leaving the step out and scaling less; that is no failure.
+        self.unread.append((step, terms if self.scaler.is_enabled() else {**terms, "gradient": norm.detach()}))
+        if self.run.compute.device.type == "cpu":
+            self.read_terms()
+        self.scaler.step(self.optimiser)
+        self.scaler.update()
+
+    def read_terms(self) -> None:
+        """Move the loss terms that are still on the device to the curve; FreeGeoError when one is not finite."""
+        for step, terms in self.unread:
+            require_finite(terms, step=step)
+            self.result.curve.append({name: float(value) for name, value in terms.items() if name != "gradient"})
+        self.unread.clear()
+
+    def save(self, next_step: int, *, seconds: float) -> None:
+        """Write a state that goes on with `next_step`; the file appears whole or not at all."""
+        assert self.run.folder is not None
+        self.read_terms()
+        tensors = {}
+        for name, parameter in self.result.adapter.named_parameters().items():
+            tensors[name] = parameter
+            for key, value in self.optimiser.state[parameter].items():
+                tensors[f"{name}|{key}"] = value
+        about = {
+            "identity": self._identity(),
+            "next_step": next_step,
+            "curve": self.result.curve,
+            "seconds": seconds,
+            "scaler": self.scaler.state_dict(),
+        }
+        write_tensors(self.run.folder / UNFINISHED_FILE, tensors, {"run": json.dumps(about)})
+
+    def _restore(self) -> int:
+        """Take over a saved state, if there is one, and return the step to go on with."""
+        path = None if self.run.folder is None else self.run.folder / UNFINISHED_FILE
+        if path is None or not path.is_file():
+            return 0
+        about, tensors = _read_state(path)
+        if about.get("identity") != self._identity():
+            raise UserError(f"{path}: this state belongs to another run. Remove it, or choose another output folder.")
+        named = self.result.adapter.named_parameters()
+        self.result.adapter.load({name: tensors[name] for name in named})
+        for name, parameter in named.items():
+            # The optimiser computes on the parameter's device, its step counter included.
+            self.optimiser.state[parameter] = {
+                key.partition("|")[2]: value.to(parameter.device)
+                for key, value in tensors.items()
+                if key.startswith(f"{name}|")
+            }
+        self.scaler.load_state_dict(about["scaler"])
+        self.result.curve, self.result.seconds = about["curve"], about["seconds"]
+        return about["next_step"]
+
+    def _identity(self) -> str:
+        """Return a fingerprint of everything but the pixels and weights that decides what the run computes."""
+        about = {
+            "model": self.run.model.spec.name,
+            "scenes": [(scene.name, scene.count) for scene in self.run.scenes],
+            "recipe": asdict(self.run.recipe),
+            "seed": self.run.seed,
+        }
+        return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _read_state(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = json.loads((file.metadata() or {}).get("run", "{}"))
+            return about, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise UserError(f"{path}: damaged state of an unfinished run ({error}). Remove it to start again.") from None
+
+
+def remove_state(folder: Path) -> None:
+    """Remove the state of a run that is finished."""
+    (folder / UNFINISHED_FILE).unlink(missing_ok=True)

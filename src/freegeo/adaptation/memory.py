@@ -1,0 +1,362 @@
+"""How much memory a run needs, before it starts, and the fastest way to make it fit.
+
+Samples are counted exactly. What a pass occupies is estimated from the shapes of the adapted linear layers
+(docs/method.md, "Memory of a step"); a plug-in with other blocks than ours gets the same estimate. Bytes throughout.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from freegeo.adaptation.adapter import count_trainable
+from freegeo.adaptation.losses.numerics import CPU_BLOCK_ELEMENTS, DEVICE_BLOCK_ELEMENTS
+from freegeo.adaptation.recipe import Recipe
+from freegeo.adaptation.samples import Place, SceneImages, sample_key
+from freegeo.adaptation.views import ViewSet, Visit
+from freegeo.errors import UserError
+from freegeo.models.api import ReconstructionModel, views_per_chunk
+from freegeo.models.precision import Compute
+
+logger = logging.getLogger(__name__)
+
+ImageSize = tuple[int, int]
+Parts = tuple[tuple[str, int], ...]
+WIDE = 4
+"""Bytes of a float32: the residual stream, norms, features, losses, trained parameters."""
+TRIPLET_ARRAYS = 13
+"""Arrays with one number per triplet that live together while the angle terms are computed."""
+WIDEST_LEVELS = 4
+"""Levels that the dense heads read."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """How a run uses memory; nothing here changes its result."""
+
+    place: Place = "device"
+    """Where samples wait for their next visit."""
+    checkpointing: bool = False
+    """Whether the student's activations are computed again in the backward pass instead of kept."""
+    parts: Parts = ()
+    """What is on the device at its fullest moment, by name."""
+    kept_bytes: int = 0
+    """All samples together, wherever they wait."""
+
+    @property
+    def peak_bytes(self) -> int:
+        """Predicted peak of the device's memory (on the CPU: of the process, less interpreter and libraries)."""
+        return sum(size for _, size in self.parts)
+
+    def summary(self) -> str:
+        """Return one line for the user."""
+        how = ", activation checkpointing" if self.checkpointing else ""
+        where = f", teacher features of {self.kept_bytes / 1e9:.2f} GB on disk" if self.place == "disk" else ""
+        return f"adaptation needs about {_listed(self.parts)}{how}{where}"
+
+
+def plan_adaptation(
+    model: ReconstructionModel,
+    scenes: Sequence[SceneImages],
+    recipe: Recipe,
+    steps: Sequence[Sequence[Visit]],
+    *,
+    compute: Compute,
+    budget: int | None = None,
+    folder: Path | None = None,
+) -> Plan:
+    """Return the fastest plan that fits: everything in memory, samples on disk, then checkpointing as well.
+
+    The first image of every scene is loaded for its size. `budget` (bytes) None: what is free now; `folder` is where
+    files of samples would lie. The model may be on the meta device. UserError when nothing fits.
+    """
+    budget = available(compute.device) if budget is None else budget
+    job = _Job(model, scenes, recipe, steps, compute)
+    free_disk = shutil.disk_usage(folder or tempfile.gettempdir()).free
+    plans = [job.plan(place, checkpointing) for checkpointing in (False, True) for place in ("device", "disk")]
+    for plan in plans:
+        if plan.peak_bytes <= budget and (plan.place != "disk" or plan.kept_bytes < free_disk):
+            logger.info("%s (%.1f GB are free)", plan.summary(), budget / 1e9)
+            return plan
+    raise UserError(
+        f"adapting {model.spec.name} needs {plans[-1].peak_bytes / 1e9:.1f} GB even with activation checkpointing (and "
+        f"{plans[-1].kept_bytes / 1e9:.1f} GB of disk), and {budget / 1e9:.1f} GB are free. Use smaller images, fewer "
+        "--views, --precision bf16 or a smaller model."
+    )
+
+
+class _Job:
+    """What a run computes, as far as memory is concerned."""
+
+    def __init__(
+        self,
+        model: ReconstructionModel,
+        scenes: Sequence[SceneImages],
+        recipe: Recipe,
+        steps: Sequence[Sequence[Visit]],
+        compute: Compute,
+    ):
+        part = model.adaptable()
+        self.recipe, self.compute, self.shape = recipe, compute, shape_of(model)
+        self.layers, self.trained = len(part.spec.loss_layers), count_trainable(model, recipe.rank)
+        patch = part.spec.patch_size
+        sizes = [scene.load((0,)).shape[-2:] for scene in scenes]
+        self.tokens = [(h // patch) * (w // patch) + self.shape.special for h, w in sizes]
+        self.visits = [visit.view_set for visits in steps for visit in visits]
+        # The largest view set decides; sets differ in the number of views and in the size of their images.
+        self.largest = max(self.visits, key=lambda view_set: len(view_set.frames) * self.tokens[view_set.scene])
+
+    def plan(self, place: Place, checkpointing: bool) -> Plan:
+        """Predict what is on the device when it is fullest: in the teacher's pass, the student's or that of `hold`."""
+        kept = self._kept_peak()
+        sample = self._sample(self.largest)
+        teacher, learning = self._teacher(sample), self._learning(checkpointing)
+        resident = [("weights", self.shape.parameters * WIDE), ("adapter and optimiser", 4 * WIDE * self.trained)]
+        waiting = kept if place == "device" else sample
+        # While the teacher runs for the last time, the sample that it makes is still missing among those kept.
+        if teacher - sample > sum(size for _, size in learning):
+            parts = [*resident, ("teacher features", max(0, waiting - sample)), ("teacher's pass", teacher)]
+        else:
+            parts = [*resident, ("teacher features", waiting), *learning]
+        return Plan(place=place, checkpointing=checkpointing, parts=tuple(parts), kept_bytes=kept)
+
+    def _teacher(self, sample: int) -> int:
+        tokens, shape = self._count(self.largest.frames), self.shape
+        passing = tokens * shape.passing(self.compute, with_adapter=False) + shape.features(tokens, self.layers)
+        return passing + shape.token_bytes(2 * tokens) + shape.half_copies(self.compute) + sample
+
+    def _learning(self, checkpointing: bool) -> list[tuple[str, int]]:
+        """Return the parts of the larger of the two passes with gradients: the student's, and that of `hold`."""
+        kept = self._count(self.largest.kept)
+        options = [self._pass(kept, self._losses(kept), checkpointing)]
+        if self.recipe.hold:
+            every = self._count(self.largest.frames)
+            options.append(self._pass(every, WIDE * every * self.shape.channels, checkpointing))
+            # The student's own tokens and targets are copies of a part of the sample.
+            options[0].append(("inputs of a step", self._sample(self.largest) * len(self.largest.kept) // 8))
+        return max(options, key=lambda parts: sum(size for _, size in parts))
+
+    def _pass(self, tokens: int, losses: int, checkpointing: bool) -> list[tuple[str, int]]:
+        """Return what a pass over `tokens` tokens leaves for its backward pass, and what comes on top of that."""
+        shape, compute = self.shape, self.compute
+        saved = shape.saved_per_token(compute, rank=self.recipe.rank, dropout=self.recipe.dropout > 0)
+        left = tokens * shape.blocks * (WIDE * shape.width if checkpointing else saved)
+        left += shape.features(tokens, self.layers) + (0 if checkpointing else shape.half_copies(compute))
+        backward = WIDE * self.layers * tokens * shape.channels + tokens * shape.passing(compute, with_adapter=True)
+        backward += tokens * saved if checkpointing else 0
+        inputs = shape.token_bytes(tokens)
+        return [("student's pass", left + inputs), max(("losses", losses), ("backward pass", backward), key=_size)]
+
+    def _losses(self, tokens: int) -> int:
+        """Gradients of all features, four blocks of the intra sweep, and the arrays over triplets."""
+        loss = self.recipe.loss
+        per_view, others = self.tokens[self.largest.scene], len(self.largest.kept) - 1
+        queries = min(loss.num_query, per_view) * (others if loss.queries == "per_view" else 1)
+        triplets = min(loss.num_reference, per_view) * loss.num_anchors * min(queries, others * per_view)
+        level = WIDE * tokens * self.shape.channels
+        on_cpu = self.compute.device.type == "cpu"
+        block = WIDE * (CPU_BLOCK_ELEMENTS if on_cpu else DEVICE_BLOCK_ELEMENTS)
+        return level * self.layers + 4 * min(level, block) + TRIPLET_ARRAYS * WIDE * triplets
+
+    def _kept_peak(self) -> int:
+        """Follow the samples through the run: one stays from its first visit to its last."""
+        left = Counter(sample_key(view_set, self.recipe) for view_set in self.visits)
+        kept: dict = {}
+        size = peak = 0
+        for view_set in self.visits:
+            key = sample_key(view_set, self.recipe)
+            left[key] -= 1
+            if left[key] and key not in kept:
+                kept[key] = self._sample(view_set)
+                size += kept[key]
+            elif not left[key]:
+                size -= kept.pop(key, 0)
+            peak = max(peak, size)
+        return peak
+
+    def _sample(self, view_set: ViewSet) -> int:
+        """Bytes of the sample of a view set (a model that adds its special tokens later has a few tokens less)."""
+        per_view, held_out = self.tokens[view_set.scene], len(view_set.frames) - len(view_set.kept)
+        read = len(view_set.frames if self.recipe.hold else view_set.kept)
+        anchors = held_out * (per_view - (0 if self.recipe.loss.cross_tokens == "all" else self.shape.special))
+        features = WIDE * self.shape.channels * (self.layers * read * per_view + anchors)
+        return self.shape.token_bytes(read * per_view) + features
+
+    def _count(self, views: Sequence[int]) -> int:
+        return len(views) * self.tokens[self.largest.scene]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape:
+    """The numbers of a model that memory depends on."""
+
+    width: int
+    blocks: int
+    """Adapted blocks: attention and feed-forward."""
+    hidden: int
+    """Width between the two linears of the feed-forward layer."""
+    gated: bool
+    parameters: int
+    adapted_parameters: int
+    """Parameters of the linears that an adapter sits on."""
+    channels: int
+    """Feature channels of the losses."""
+    special: int
+
+    def saved_per_token(self, compute: Compute, *, rank: int, dropout: bool) -> int:
+        """Bytes that one adapted block keeps per token from the forward to the backward pass."""
+        e, d, h = narrow(compute), self.width, self.hidden
+        heads = max(1, d // 64)
+        norm_inputs = 2 * WIDE * d
+        lora_inputs = e * (3 * d + h)
+        attention = 6 * e * d
+        feed_forward = 3 * e * h if self.gated else e * h
+        statistics = WIDE * (4 + 5 * heads)
+        total = norm_inputs + lora_inputs + attention + feed_forward + statistics + 4 * rank * e
+        # A dropout mask is one byte per element in CUDA's fused dropout and in ours on the CPU, elsewhere a number.
+        return total + (3 * d + h) * ((WIDE if compute.device.type == "mps" else 1) if dropout else 0)
+
+    def passing(self, compute: Compute, *, with_adapter: bool) -> int:
+        """Bytes per token that live while one block is computed and are gone afterwards, at the widest place."""
+        e, d, h = narrow(compute), self.width, self.hidden
+        inner = 4 * h if self.gated else 2 * h
+        low_rank = WIDE * (2 * h if self.gated else h) if with_adapter and compute.precision != "fp32" else 0
+        return 3 * WIDE * d + e * (d + inner) + low_rank
+
+    def features(self, tokens: int, layers: int) -> int:
+        """Feature tensors of some layers while `aggregate` makes them: the joined halves, and the normalised copy."""
+        return 2 * WIDE * layers * tokens * self.channels
+
+    def half_copies(self, compute: Compute) -> int:
+        """Half copies of the adapted weights, which autocast makes for every pass."""
+        return 0 if compute.precision == "fp32" else 2 * self.adapted_parameters
+
+    def token_bytes(self, tokens: int) -> int:
+        """Tokens between `embed` and `aggregate`."""
+        return WIDE * tokens * self.width
+
+
+def shape_of(model: ReconstructionModel) -> Shape:
+    """Read a model's shape off its adapter targets; the model may be on the meta device, and may carry an adapter."""
+    part = model.adaptable()
+    linears = [_base(part.get_submodule(name)) for name in part.adapter_targets()]
+    attention = [linear for linear in linears if linear.out_features == 3 * linear.in_features]
+    # A third-party model may have no joint qkv layer; its first layer then stands for its width.
+    width = (attention or linears)[0].in_features
+    contraction = [linear for linear in linears if linear.out_features == width and linear.in_features != width]
+    expansion = [linear for linear in linears if linear.in_features == width and linear.out_features > width]
+    hidden = contraction[0].in_features if contraction else width
+    return Shape(
+        width=width,
+        blocks=max(1, len(attention)),
+        hidden=hidden,
+        gated=any(linear.out_features == 2 * hidden for linear in expansion),
+        parameters=sum(p.numel() for name, p in model.named_parameters() if ".lora_" not in name),
+        adapted_parameters=sum(linear.weight.numel() for linear in linears),
+        # Both families put the outputs of two blocks beside each other.
+        channels=2 * width,
+        special=part.spec.special_tokens,
+    )
+
+
+def _base(module: nn.Module) -> nn.Linear:
+    linear = getattr(module, "base_layer", module)
+    assert isinstance(linear, nn.Linear)
+    return linear
+
+
+def narrow(compute: Compute) -> int:
+    """Bytes of an element that matrix products read and write."""
+    return WIDE if compute.precision == "fp32" else 2
+
+
+def plan_reconstruction(
+    model: ReconstructionModel, views: int, image_hw: ImageSize, *, compute: Compute, budget: int | None = None
+) -> tuple[Parts, int]:
+    """Return what is on the device while `views` images are reconstructed together, and how many views would fit.
+
+    Images are embedded and dense maps decoded a few views at a time; tokens, features and results grow with the number
+    of views. `budget` (bytes) None: what is free now, and what the model occupies already. UserError when the views do
+    not fit; it says how many would. The model may be on the meta device.
+    """
+    shape, spec = shape_of(model), model.adaptable().spec
+    resident = shape.parameters * WIDE
+    if budget is None:
+        placed = next(iter(model.parameters())).device.type == compute.device.type
+        budget = available(compute.device) + (resident if placed else 0)
+    pixels = math.prod(image_hw)
+    per_view = (image_hw[0] // spec.patch_size) * (image_hw[1] // spec.patch_size) + shape.special
+    maps = 2 * WIDE * pixels  # depth and confidence
+    # Widest moment of the dense head per view: its last maps at image size, and the fused pyramid at 8 per patch.
+    head = getattr(getattr(model.adaptable(), "config", None), "head_features", 256)
+    head_bytes = int(WIDE * pixels * (head + 64 + 3 * head * (8 / spec.patch_size) ** 2))
+    passing, copies = shape.passing(compute, with_adapter=False), shape.half_copies(compute)
+
+    def parts(count: int) -> Parts:
+        tokens = count * per_view
+        features = shape.features(tokens, WIDEST_LEVELS)
+        stages = {
+            "aggregating": shape.token_bytes(2 * tokens) + copies + features + tokens * passing,
+            "decoding": features + count * maps + min(count, 8) * head_bytes,
+            "embedding": shape.token_bytes(tokens) + copies
+            + min(count, views_per_chunk(compute.device)) * per_view * passing,
+        }  # fmt: skip
+        widest = max(stages.items(), key=_size)
+        return ("weights", resident), ("images", 3 * WIDE * count * pixels), widest
+
+    def total(count: int) -> int:
+        return sum(size for _, size in parts(count))
+
+    # From 8 views on everything grows by the same amount per view.
+    slope = (total(128) - total(64)) / 64
+    fitting = int(64 + (budget - total(64)) // slope) if budget > total(64) else 64
+    fitting = next((count for count in range(fitting, 0, -1) if total(count) <= budget), 0)
+    if total(views) > budget:
+        advice = (
+            f"use at most {fitting} views (--max-views {fitting}) or smaller images"
+            if fitting
+            else "use a smaller model or another device"
+        )
+        raise UserError(
+            f"reconstructing {views} images of {image_hw[1]} x {image_hw[0]} pixels with {model.spec.name} needs about "
+            f"{total(views) / 1e9:.1f} GB and {budget / 1e9:.1f} GB are free: {advice}."
+        )
+    return parts(views), fitting
+
+
+def available(device: torch.device) -> int:
+    """Bytes that a run may use on a device, with some room left for what no plan sees."""
+    if device.type == "cuda":
+        return int(torch.cuda.mem_get_info(device)[0] * 0.92)
+    return int(_host_available() * 0.8)
+
+
+def _host_available() -> int:
+    """Bytes of main memory that are free or can be freed."""
+    lines = Path("/proc/meminfo").read_text().splitlines() if Path("/proc/meminfo").is_file() else []
+    for line in lines:
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return 8 << 30
+
+
+def _listed(parts: Parts) -> str:
+    """Return "12.3 GB (weights 2.30, ...)"."""
+    listed = ", ".join(f"{name} {size / 1e9:.2f}" for name, size in parts if size)
+    return f"{sum(size for _, size in parts) / 1e9:.2f} GB ({listed})"
+
+
+def _size(part: tuple[str, int]) -> int:
+    return part[1]

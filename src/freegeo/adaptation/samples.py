@@ -1,0 +1,294 @@
+"""What a step needs of a view set, made once with the frozen model: the left column of Algorithm 1, computed ahead.
+
+The teacher never changes, and neither does anything below the first cross-view layer. So both run once per view set;
+every later visit of the set costs the student's pass only (docs/method.md, "Roles and view sets").
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+import tempfile
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from freegeo.adaptation.adapter import Adapter
+from freegeo.adaptation.losses import (
+    LossConfig,
+    Precision,
+    StepDraws,
+    TeacherTargets,
+    choose_precision,
+    draw_tokens,
+    held_out_tokens,
+    teacher_spread,
+    teacher_targets,
+)
+from freegeo.adaptation.losses.targets import Level
+from freegeo.adaptation.recipe import Recipe
+from freegeo.adaptation.views import ViewSet, Visit
+from freegeo.errors import UserError
+from freegeo.models.api import ReconstructionModel, embed_in_chunks
+from freegeo.models.precision import Compute
+from freegeo.types import Features, ImageBatch, PhotoLike, ViewTokens
+
+Place = Literal["device", "disk"]
+"""Where samples wait for their next visit: on the model's device, or in files that the system maps into memory."""
+DRAW_SEED_STRIDE = 1_000_003
+SPREAD_HEADROOM = 2.0
+"""How far the student's softmax inputs may spread beyond the teacher's, where they are measured once per view set."""
+AHEAD = 2
+"""View sets whose images are decoded in the background before they are needed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneImages:
+    """The images of one scene; `load` returns the chosen ones as (S, 3, H, W) in [0, 1], all of one size.
+
+    `load` is called from a background thread, one call at a time.
+    """
+
+    name: str
+    count: int
+    load: Callable[[Sequence[int]], Tensor]
+
+    @classmethod
+    def from_batch(cls, name: str, batch: ImageBatch) -> SceneImages:
+        """Use images that are already at the model's size."""
+        return cls(name=name, count=len(batch), load=lambda frames: batch.images[list(frames)])
+
+    @classmethod
+    def from_photos(
+        cls, name: str, photos: Sequence[PhotoLike], model: ReconstructionModel, recipe: Recipe
+    ) -> SceneImages:
+        """Decode photos on demand, as the model reads them or squashed as the recipe asks.
+
+        UserError when the recipe's square is no whole number of the model's patches.
+        """
+        if recipe.squash is not None and recipe.squash % model.spec.patch_size:
+            raise UserError(
+                f"recipe '{recipe.name}' squashes images to {recipe.squash} pixels; {model.spec.name} cannot read them "
+                f"(patches of {model.spec.patch_size}). Choose another recipe."
+            )
+
+        def load(frames: Sequence[int]) -> Tensor:
+            chosen = [photos[frame] for frame in frames]
+            if recipe.squash is None:
+                return model.preprocess(chosen).images
+            return torch.cat([squashed(torch.from_numpy(photo.read()), recipe.squash) for photo in chosen])
+
+        return cls(name=name, count=len(photos), load=load)
+
+
+def squashed(pixels_HW3: Tensor, side: int) -> Tensor:
+    """Resize a photo bilinearly to a square (1, 3, side, side) in [0, 1], whatever its aspect."""
+    image = pixels_HW3.permute(2, 0, 1)[None].float() / 255
+    return F.interpolate(image, size=(side, side), mode="bilinear", align_corners=False)
+
+
+def released_augmentation(images: Tensor, seed: int) -> Tensor:
+    """Mirror a whole view set and change the brightness of some views, as a fixed function of the set's seed.
+
+    One draw decides the mirror (p = .5); then per view a draw decides (p = .5) and a second one gives the factor in
+    [.8, 1.2]; results are clipped to [0, 1] (docs/method.md, "Augmentation and view draws").
+    """
+    generator = random.Random(seed)
+    if generator.random() < 0.5:
+        images = images.flip(-1)
+    factors = [generator.uniform(0.8, 1.2) if generator.random() < 0.5 else 1.0 for _ in images]
+    return (images * images.new_tensor(factors)[:, None, None, None]).clamp(0, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """Everything a visit reads of its view set; tensors have a batch of 1 and no gradient."""
+
+    tokens: ViewTokens
+    """The views that pass through the student: the kept ones, or all N where the recipe holds them."""
+    teacher: Features
+    """The teacher's features of the same views at the loss layers."""
+    held_out: Tensor
+    """(1, L, C): the teacher's tokens of the held-out views at the last loss layer, one view after another."""
+    kept: tuple[int, ...]
+    """Positions of the student's views among `tokens`."""
+    form: Precision | None = None
+    """How the all-pairs KL is computed; None: the loss measures it, which makes an accelerator wait."""
+
+    def student(self) -> tuple[ViewTokens, Mapping[int, Level]]:
+        """Return tokens and teacher features of the student's views."""
+        if len(self.kept) == self.tokens.tokens.shape[1]:
+            return self.tokens, self.teacher.levels
+        return self.tokens.select(self.kept), self.teacher.select(self.kept).levels
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors by name."""
+        named = {f"tokens|{name}": value for name, value in self.tokens.tensors().items()}
+        named |= {f"teacher|{name}": value for name, value in self.teacher.tensors().items()}
+        return {**named, "held_out|": self.held_out}
+
+    def with_tensors(self, tensors: Mapping[str, Tensor]) -> Sample:
+        """Return the sample with other tensors, by the names of `tensors`."""
+        parts: dict[str, dict[str, Tensor]] = {}
+        for name, value in tensors.items():
+            part, _, inner = name.partition("|")
+            parts.setdefault(part, {})[inner] = value
+        return replace(
+            self,
+            tokens=ViewTokens.from_tensors(parts["tokens"]),
+            teacher=Features.from_tensors(parts["teacher"]),
+            held_out=parts["held_out"][""],
+        )
+
+    def to(self, device: torch.device) -> Sample:
+        """Return the sample on a device."""
+        return replace(
+            self, tokens=self.tokens.to(device), teacher=self.teacher.to(device), held_out=self.held_out.to(device)
+        )
+
+
+class Samples:
+    """The samples of a run: each made at its view set's first visit and kept until its last."""
+
+    def __init__(
+        self,
+        adapter: Adapter,
+        scenes: Sequence[SceneImages],
+        recipe: Recipe,
+        steps: Sequence[Sequence[Visit]],
+        *,
+        compute: Compute,
+        place: Place,
+        folder: Path | None,
+        seed: int,
+    ):
+        """`steps` are those still to come. `folder` (None: the system's temporary one) holds the files of `disk`."""
+        self._adapter, self._recipe, self._compute, self._seed = adapter, recipe, compute, seed
+        view_sets = [visit.view_set for visits in steps for visit in visits]
+        self._left = Counter(sample_key(view_set, recipe) for view_set in view_sets)
+        self._kept: dict[SampleKey, Sample] = {}
+        self._folder = _empty_folder(folder) if place == "disk" else None
+        self._files = 0
+        distinct = {sample_key(view_set, recipe): view_set for view_set in reversed(view_sets)}
+        in_order = dict.fromkeys(sample_key(view_set, recipe) for view_set in view_sets)
+        self._images = loaded_ahead(scenes, [distinct[key] for key in in_order])
+
+    def take(self, visit: Visit) -> Sample:
+        """Return the sample of a visit, on the device; visits come in the order of `steps`."""
+        key = sample_key(visit.view_set, self._recipe)
+        self._left[key] -= 1
+        sample = self._kept.pop(key, None)
+        if sample is None:
+            sample = self._make(visit)
+            if self._left[key] and self._folder is not None:
+                sample = self._in_file(sample)
+        if self._left[key]:
+            self._kept[key] = sample
+        return sample.to(self._compute.device)
+
+    def close(self) -> None:
+        """Stop decoding, drop everything and remove the files."""
+        self._images.close()
+        self._kept.clear()
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    @torch.no_grad()
+    def _make(self, visit: Visit) -> Sample:
+        """Embed the views of a set and run the teacher on them."""
+        view_set, config, model = visit.view_set, self._recipe.loss, self._adapter.model
+        images = next(self._images)
+        if self._recipe.augmentation == "released":
+            images = released_augmentation(images, view_set.seed)
+        with self._adapter.off(), self._compute.autocast():
+            tokens = embed_in_chunks(model, images, device=self._compute.device, layers=model.spec.loss_layers)
+            features = loss_features(model, tokens)
+        read = view_set.positions if self._recipe.hold else view_set.kept
+        sample = Sample(
+            tokens=tokens.select(read),
+            teacher=features.select(read),
+            held_out=held_out_tokens(features.levels[max(features.levels)], view_set.kept, config),
+            kept=tuple(read.index(position) for position in view_set.kept),
+        )
+        if self._compute.device.type == "cpu" or not config.uses_distances or config.pairing != "all":
+            return sample
+        # Read once per view set instead of in every step, where an accelerator would have to wait for it.
+        spread = teacher_spread(*targets_of(sample, visit, config, seed=self._seed), config)
+        return replace(sample, form=choose_precision(float(spread), headroom=SPREAD_HEADROOM))
+
+    def _in_file(self, sample: Sample) -> Sample:
+        """Move a sample to a file; its tensors are read from there, by the system, when they are used."""
+        from safetensors import safe_open
+        from safetensors.torch import save_file
+
+        assert self._folder is not None
+        path = self._folder / f"{self._files}.safetensors"
+        self._files += 1
+        save_file({name: tensor.cpu().contiguous() for name, tensor in sample.tensors().items()}, path)
+        with safe_open(path, framework="pt") as file:
+            return sample.with_tensors({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
+
+
+SampleKey = tuple[int, tuple[int, ...], tuple[int, ...], int | None]
+
+
+def sample_key(view_set: ViewSet, recipe: Recipe) -> SampleKey:
+    """Return what a view set's pixels depend on: sets of equal key share a sample."""
+    variant = view_set.seed if recipe.augmentation != "none" else None
+    return view_set.scene, view_set.frames, view_set.kept, variant
+
+
+def loss_features(model: ReconstructionModel, tokens: ViewTokens) -> Features:
+    """Return what a loss compares: the features at the loss layers, the first view being the reference."""
+    return model.aggregate(tokens, layers=model.spec.loss_layers, reference="first")
+
+
+def targets_of(sample: Sample, visit: Visit, config: LossConfig, *, seed: int) -> tuple[TeacherTargets, StepDraws]:
+    """Draw the tokens of a visit, a function of seed and step alone, and gather the teacher's side of the loss."""
+    kept = sample.student()[1]
+    patch, special = kept[max(kept)]
+    draws = draw_tokens(
+        config,
+        tokens_per_view=patch.shape[2] + (special.shape[2] if config.cross_tokens == "all" else 0),
+        student_views=len(visit.view_set.kept),
+        held_out_views=len(visit.view_set.frames) - len(visit.view_set.kept),
+        generator=torch.Generator().manual_seed(seed * DRAW_SEED_STRIDE + visit.step),
+    ).to(patch.device)
+    return teacher_targets(kept, sample.held_out, draws, config), draws
+
+
+def loaded_ahead(scenes: Sequence[SceneImages], view_sets: Sequence[ViewSet]) -> Generator[Tensor]:
+    """Yield the images (N, 3, H, W) of view sets in order; a background thread loads the next ones meanwhile.
+
+    Raises what loading raised. Closing the generator stops the thread.
+    """
+    waiting, running = deque(view_sets), deque[Future[Tensor]]()
+    thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="freegeo-images")
+    try:
+        while waiting or running:
+            while waiting and len(running) < AHEAD:
+                view_set = waiting.popleft()
+                running.append(thread.submit(scenes[view_set.scene].load, view_set.frames))
+            yield running.popleft().result()
+    finally:
+        thread.shutdown(cancel_futures=True)
+
+
+def _empty_folder(parent: Path | None) -> Path:
+    """Return a folder for the files of one run at a time; what a killed run left there is removed."""
+    if parent is None:
+        return Path(tempfile.mkdtemp(prefix="freegeo-samples-"))
+    folder = parent / "freegeo-samples"
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written to ({error.strerror}). Choose another output folder.") from None
+    return folder

@@ -1,0 +1,472 @@
+"""Algorithm 1: it learns, equals a plain loop to the bit, repeats itself, stops before it does harm, and continues."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from freegeo.adaptation import adapt as adapting
+from freegeo.adaptation.adapt import adapt, learning_rate
+from freegeo.adaptation.adapter import Adapter, PackedDropout
+from freegeo.adaptation.losses import adaptation_loss, draw_tokens, feature_distance, held_out_tokens, teacher_targets
+from freegeo.adaptation.memory import Plan
+from freegeo.adaptation.recipe import paper, released
+from freegeo.adaptation.samples import SceneImages, released_augmentation
+from freegeo.adaptation.views import schedule
+from freegeo.errors import FreeGeoError, UserError
+from freegeo.models.precision import Compute
+from tiny_models import PATCH, noise, noise_scene, outputs, quick, same, tensors, tiny_da3, tiny_vggt
+
+IMAGES = noise(4)
+MODELS = {"da3": tiny_da3, "vggt": tiny_vggt}
+
+
+@pytest.fixture(params=MODELS)
+def build(request):
+    return MODELS[request.param]
+
+
+def run(model, scenes, recipe, **options):
+    return adapt(model, scenes, recipe, **{"seed": 42, **options})
+
+
+def wide_scene(views: int = 6) -> SceneImages:
+    images = noise(views)[..., : 3 * PATCH, :]
+    return SceneImages(name="wide", count=views, load=lambda frames: images[list(frames)])
+
+
+# The algorithm --------------------------------------------------------------------------------------------------------
+
+
+def plain_adaptation(model, scenes, recipe, seed=42):
+    """Algorithm 1 without any measure that saves time: embedding and teacher anew in every visit."""
+    generator = torch.Generator().manual_seed(seed)
+    adapter = Adapter.attach(model, rank=recipe.rank, alpha=recipe.alpha, dropout=recipe.dropout, generator=generator)
+    optimiser = torch.optim.AdamW(adapter.parameters(), lr=0.0, weight_decay=recipe.weight_decay, fused=True)
+    steps = schedule([scene.count for scene in scenes], recipe, seed)
+
+    def features(images):
+        # One view at a time, as the engine embeds on a CPU.
+        tokens = type(first := model.embed(images[None, :1])).join_views(
+            [first, *(model.embed(images[None, i : i + 1]) for i in range(1, len(images)))]
+        )
+        return model.aggregate(tokens, layers=model.spec.loss_layers).levels
+
+    for step, visits in enumerate(steps):
+        optimiser.zero_grad()
+        torch.manual_seed(seed * 1_000_003 + step)
+        for visit in visits:
+            kept = list(visit.view_set.kept)
+            images = scenes[visit.view_set.scene].load(visit.view_set.frames)
+            if recipe.augmentation == "released":
+                images = released_augmentation(images, visit.view_set.seed)
+            with torch.no_grad(), adapter.off():
+                teacher = features(images)
+            levels = {layer: (patch[:, kept], special[:, kept]) for layer, (patch, special) in teacher.items()}
+            patch, special = teacher[max(teacher)]
+            draws = draw_tokens(
+                recipe.loss,
+                tokens_per_view=patch.shape[2] + (special.shape[2] if recipe.loss.cross_tokens == "all" else 0),
+                student_views=len(kept),
+                held_out_views=len(images) - len(kept),
+                generator=torch.Generator().manual_seed(seed * 1_000_003 + step),
+            )
+            held_out = held_out_tokens((patch, special), kept, recipe.loss)
+            targets = teacher_targets(levels, held_out, draws, recipe.loss)
+            model.train(recipe.dropout > 0)
+            loss, _ = adaptation_loss(features(images[kept]), targets, draws, recipe.loss)
+            (loss * (1 / len(visits))).backward()
+            if recipe.hold:
+                held = recipe.hold * feature_distance(features(images), teacher, recipe.loss)[0]
+                (held * (1 / len(visits))).backward()
+            model.eval()
+        for group in optimiser.param_groups:
+            group["lr"] = learning_rate(step, len(steps), recipe)
+        torch.nn.utils.clip_grad_norm_(adapter.parameters(), recipe.clip)
+        optimiser.step()
+    return [parameter.detach() for parameter in adapter.parameters()]
+
+
+CASES = {
+    "da3-scene": (tiny_da3, lambda model: quick(model, steps=5)),
+    "vggt-scene": (tiny_vggt, lambda model: quick(model, steps=5)),
+    "da3-batch": (tiny_da3, lambda model: quick(model, epochs=2, batch=3)),
+    "vggt-hold-batch": (tiny_vggt, lambda model: quick(model, epochs=2, batch=2, hold=0.5)),
+    "da3-dropout-hold": (tiny_da3, lambda model: quick(model, steps=4, dropout=0.1, hold=1.0)),
+    "da3-paper": (tiny_da3, lambda model: paper(model.spec, "eth3d").changed(sets_per_scene=3, rank=4)),
+    "da3-released": (tiny_da3, lambda model: released("released-da3", "eth3d").changed(epochs=1, rank=2)),
+    "vggt-released": (tiny_vggt, lambda model: released("released-vggt", "eth3d").changed(sets_per_scene=2, rank=2)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_run_equals_a_plain_loop_to_the_bit(case):
+    build, recipe_of = CASES[case]
+    recipe = recipe_of(build())
+    scenes = [noise_scene(9), noise_scene(5, seed=1)]
+    with torch.random.fork_rng(devices=[]):
+        wanted = plain_adaptation(build(), scenes, recipe)
+    assert same(tensors(run(build(), scenes, recipe)), wanted)
+
+
+def test_a_batch_s_gradient_is_the_mean_of_its_view_sets_gradients():
+    """In float64, where rounding does not decide: one step of a batch moves A and B by the mean of two single steps."""
+
+    def gradients(recipe):
+        model, found = tiny_da3().double(), []
+        update = torch.optim.AdamW.step
+
+        def record(self, *args, **options):
+            found.append([p.grad.clone() for group in self.param_groups for p in group["params"]])
+            return update(self, *args, **options)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(torch.optim.AdamW, "step", record)
+            # No rate and no clipping: every step meets the same adapter and leaves its gradient as it is.
+            images = noise(9).double()
+            scene = SceneImages(name="double", count=9, load=lambda frames: images[list(frames)])
+            run(model, [scene], recipe.changed(lr=1e-30, final_lr=1e-30, clip=1e9, weight_decay=0.0))
+        return found
+
+    recipe = quick(tiny_da3(), epochs=1, sets_per_scene=2, distinct_seeds=2)
+    # With as many draws as there are tokens, the draws of two steps differ in their order only.
+    recipe = replace(recipe, loss=replace(recipe.loss, num_reference=16, num_query=48))
+    one, two = gradients(recipe.changed(batch=1))
+    (both,) = gradients(recipe.changed(batch=2))
+    for a, b, mean in zip(one, two, both, strict=True):
+        assert torch.allclose((a + b) / 2, mean, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("plan", [Plan(place="disk"), Plan(checkpointing=True)], ids=["disk", "checkpointing"])
+@pytest.mark.parametrize("hold", [0.0, 1.0])
+def test_a_plan_changes_no_bit_and_leaves_no_file(build, plan, hold, tmp_path):
+    def result(plan):
+        recipe = quick(build(), steps=4, sets_per_scene=2, distinct_seeds=2, hold=hold)
+        return run(build(), [noise_scene(9), wide_scene()], recipe, plan=plan, resume_in=tmp_path)
+
+    plain, planned = result(Plan()), result(plan)
+    assert plain.curve == planned.curve
+    assert same(tensors(plain), tensors(planned))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_running_out_of_memory_is_met_once_with_checkpointing_and_disk(build, caplog, monkeypatch):
+    recipe, whole, used = quick(build(), steps=3), run(build(), [noise_scene(9)], quick(build(), steps=3)), []
+    losses = adapting.adaptation_loss
+
+    def failing(*args, **options):
+        used.append(args)
+        if len(used) == 2:
+            raise torch.OutOfMemoryError("the device is full")
+        return losses(*args, **options)
+
+    monkeypatch.setattr(adapting, "adaptation_loss", failing)
+    result = run(build(), [noise_scene(9)], recipe)
+    assert same(tensors(result), tensors(whole))
+    assert len(used) == 2 + 3
+    assert "once more with activation checkpointing" in caplog.text
+
+    def always(*args, **options):
+        raise torch.OutOfMemoryError("the device is full")
+
+    monkeypatch.setattr(adapting, "adaptation_loss", always)
+    model = build()
+    with pytest.raises(FreeGeoError, match="ran out of memory even with"):
+        run(model, [noise_scene(9)], recipe)
+    monkeypatch.undo()
+    run(model, [noise_scene(9)], quick(model, steps=1))
+
+
+# What adaptation does -------------------------------------------------------------------------------------------------
+
+
+def test_the_loss_falls(build):
+    model = build()
+    frozen = outputs(model, IMAGES)
+    result = run(model, [noise_scene(9)], quick(model, steps=18, sets_per_scene=2, distinct_seeds=2))
+    totals = [terms["total"] for terms in result.curve]
+    assert len(totals) == 18
+    # Every pair of steps sees both view sets.
+    assert sum(totals[-4:]) < 0.8 * sum(totals[:4])
+    assert result.loss_change() == {"first": totals[0], "last": totals[-1]}
+    assert not same(outputs(model, IMAGES), frozen)
+    with result.adapter.off():
+        assert same(outputs(model, IMAGES), frozen)
+
+
+def test_every_part_of_the_adapter_moves_and_the_frozen_weights_do_not(build):
+    model = build()
+    weights = {name: value.clone() for name, value in model.state_dict().items()}
+    fresh = Adapter.attach(model, rank=4, alpha=4, dropout=0.0, generator=torch.Generator().manual_seed(42))
+    before = {name: parameter.detach().clone() for name, parameter in fresh.named_parameters().items()}
+    fresh.detach()
+    result = run(model, [noise_scene(8)], quick(model))
+    after = result.adapter.named_parameters()
+    assert not [name for name, value in before.items() if torch.equal(value, after[name])]
+    result.adapter.detach()
+    assert all(torch.equal(value, weights[name]) for name, value in model.state_dict().items())
+
+
+def test_the_same_seed_gives_the_same_tensors_and_another_seed_others(build):
+    def result(seed):
+        model = build()
+        return run(model, [noise_scene(9)], quick(model, steps=2, dropout=0.1), seed=seed)
+
+    one, two, other = result(7), result(7), result(8)
+    assert same(tensors(one), tensors(two))
+    assert one.curve == two.curve
+    assert not same(tensors(one), tensors(other))
+
+
+def test_the_global_generator_is_left_alone():
+    model = tiny_da3()
+    before = torch.get_rng_state()
+    run(model, [noise_scene(8)], quick(model, steps=1, dropout=0.1))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("precision", ["bf16", "fp16"])
+def test_half_precision_learns_in_full_precision_parameters(precision):
+    model = tiny_da3()
+    recipe = quick(model, steps=6, sets_per_scene=1, distinct_seeds=1)
+    result = run(model, [noise_scene(9)], recipe, compute=Compute(precision=precision))
+    assert {tensor.dtype for tensor in tensors(result)} == {torch.float32}
+    assert result.curve[-1]["total"] < result.curve[0]["total"]
+
+
+@pytest.mark.parametrize("views", [3, 4, 5, 6, 7])
+def test_few_views_are_enough(build, views):
+    result = run(model := build(), [noise_scene(views)], quick(model, steps=2))
+    assert all(terms["total"] > 0 for terms in result.curve)
+
+
+def test_fewer_than_three_views_are_refused_and_leave_the_model_plain():
+    model = tiny_da3()
+    with pytest.raises(UserError, match="at least 3 photos, got 2"):
+        run(model, [noise_scene(2)], quick(model))
+    run(model, [noise_scene(3)], quick(model, steps=1))
+
+
+def test_epochs_and_steps_are_announced():
+    model, steps, epochs = tiny_da3(), [], []
+    run(
+        model,
+        [noise_scene(9)],
+        quick(model, epochs=2, batch=2),
+        on_step=lambda progress: steps.append((progress.step, progress.steps, progress.epoch)),
+        on_epoch=lambda epoch, adapter: epochs.append((epoch, adapter.parameters()[0].detach().clone())),
+    )
+    assert steps == [(0, 4, 0), (1, 4, 0), (2, 4, 1), (3, 4, 1)]
+    assert [epoch for epoch, _ in epochs] == [0, 1]
+    assert not torch.equal(epochs[0][1], epochs[1][1])
+
+
+def test_a_saved_run_describes_itself_and_leaves_no_state(tmp_path, monkeypatch):
+    monkeypatch.setattr(adapting, "SAVE_EVERY_S", -1.0)
+    model = tiny_da3()
+    result = run(model, [noise_scene(8)], quick(model, steps=2), resume_in=tmp_path)
+    assert (tmp_path / adapting.UNFINISHED_FILE).is_file()
+    result.save(tmp_path)
+    assert not (tmp_path / adapting.UNFINISHED_FILE).exists()
+    about = json.loads((tmp_path / "freegeo.json").read_text())
+    assert about["recipe"]["loss"]["temperature"] == model.spec.adaptation.temperature
+    assert len(about["loss_curve"]) == 2
+    assert (about["scenes"], about["seed"]) == (["noise-0"], 42)
+
+
+@pytest.mark.parametrize("probability", [0.1, 0.5])
+def test_packed_dropout_keeps_the_expectation_and_drops_the_same_in_the_backward_pass(probability):
+    torch.manual_seed(0)
+    dropout = PackedDropout(probability)
+    x = torch.ones(513, 1001, requires_grad=True)
+    found = dropout(x)
+    found.sum().backward()
+    assert torch.equal(found, x.grad)
+    assert (found == 0).double().mean().item() == pytest.approx(probability, abs=3e-3)
+    assert found.mean().item() == pytest.approx(1, abs=3e-3)
+    # Rows and columns are dropped independently of each other.
+    dropped = (found == 0).double()
+    for axis in (0, 1):
+        spread = dropped.mean(axis).std().item()
+        assert spread == pytest.approx((probability * (1 - probability) / dropped.shape[axis]) ** 0.5, rel=0.15)
+    neighbours = (dropped[:, 1:] * dropped[:, :-1]).mean().item()
+    assert neighbours == pytest.approx(probability**2, abs=5e-3)
+    dropout.eval()
+    assert dropout(x) is x
+
+
+# Numbers that are not finite ------------------------------------------------------------------------------------------
+
+
+class Breaker:
+    """Makes one element of a layer's output not finite in the student's n-th pass."""
+
+    def __init__(self, layer: nn.Module, at: int, value: float):
+        self.passes, self.at, self.value = 0, at, value
+        layer.register_forward_hook(self)
+
+    def __call__(self, _module, _inputs, output):
+        if not torch.is_grad_enabled():
+            return output
+        self.passes += 1
+        return (
+            torch.where(torch.arange(output.shape[-1]) == 0, self.value, output) if self.passes == self.at else output
+        )
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_loss_that_is_not_finite_stops_before_the_optimiser(build, value, monkeypatch):
+    model, adapters, seen = build(), [], []
+    attach = Adapter.attach
+    monkeypatch.setattr(
+        Adapter, "attach", lambda *args, **options: adapters.append(attach(*args, **options)) or adapters[0]
+    )
+    blocks = model.backbone["pretrained"].blocks if hasattr(model, "backbone") else model.aggregator.global_blocks
+    Breaker(blocks[-1], at=3, value=value)
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+
+    def remember(progress):
+        seen.append([parameter.detach().clone() for parameter in adapters[0].parameters()])
+
+    with pytest.raises(FreeGeoError, match="Loss term intra is not finite at step 2") as error:
+        run(model, [noise_scene(9)], quick(model), on_step=remember)
+    assert not isinstance(error.value, UserError)
+    assert len(seen) == 2
+    assert same([parameter.detach() for parameter in adapters[0].parameters()], seen[-1])
+    assert all(torch.equal(tensor, before[name]) for name, tensor in model.state_dict().items())
+
+
+def test_a_gradient_that_is_not_finite_stops_the_run(monkeypatch):
+    losses = adapting.adaptation_loss
+
+    def broken(*args, **options):
+        loss, terms = losses(*args, **options)
+        # The value stays as it is; its gradient is infinite.
+        return loss + (loss - loss.detach()).abs().sqrt(), terms
+
+    monkeypatch.setattr(adapting, "adaptation_loss", broken)
+    model = tiny_da3()
+    with pytest.raises(FreeGeoError, match="gradient is not finite at step 0"):
+        run(model, [noise_scene(9)], quick(model))
+
+
+# Stopping and going on ------------------------------------------------------------------------------------------------
+
+
+class Killed(BaseException):
+    """Stands for the end of the process."""
+
+
+@pytest.mark.parametrize("at", [1, 3])
+def test_an_interrupted_run_goes_on_to_the_same_end(build, at, tmp_path, monkeypatch):
+    monkeypatch.setattr(adapting, "SAVE_EVERY_S", -1.0)
+    scenes = [noise_scene(9), noise_scene(4, seed=1)]
+
+    def result(on_step=lambda progress: None, **options):
+        model = build()
+        return run(model, scenes, quick(model, steps=5, dropout=0.1), on_step=on_step, **options)
+
+    def interrupt(progress):
+        if progress.step == at:
+            raise Killed
+
+    whole, resumed_steps = result(), []
+    with pytest.raises(Killed):
+        result(interrupt, resume_in=tmp_path)
+    resumed = result(lambda progress: resumed_steps.append(progress.step), resume_in=tmp_path)
+    assert resumed_steps == list(range(at, 5))
+    assert resumed.curve == whole.curve
+    assert same(tensors(resumed), tensors(whole))
+
+
+def test_a_recipe_that_draws_anew_goes_on_to_the_same_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(adapting, "SAVE_EVERY_S", -1.0)
+
+    def result(on_step=lambda progress: None, **options):
+        recipe = released("released-vggt", "eth3d").changed(epochs=3, sets_per_scene=2, rank=2, batch=1)
+        return run(tiny_vggt(), [noise_scene(9)], recipe, on_step=on_step, **options)
+
+    def stop(progress):
+        if progress.step == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        result(stop, resume_in=tmp_path)
+    assert same(tensors(result(resume_in=tmp_path)), tensors(result()))
+
+
+PROGRAM = """
+import sys, time, torch
+sys.path[:0] = {path!r}
+torch.set_num_threads(1)
+from pathlib import Path
+from freegeo.adaptation import adapt as adapting
+from freegeo.adaptation.memory import Plan
+from tiny_models import noise_scene, quick, tiny_da3
+adapting.SAVE_EVERY_S = -1.0
+model = tiny_da3()
+def shown(progress):
+    print(progress.step, flush=True)
+    if progress.step == 5:
+        time.sleep(60)
+adapting.adapt(model, [noise_scene(9), noise_scene(5, seed=1)], quick(model, steps=8, batch=2, dropout=0.1), seed=42,
+               plan=Plan(place="disk"), resume_in=Path({folder!r}), on_step=shown)
+"""
+
+
+def test_a_killed_process_s_run_ends_with_the_same_tensors(tmp_path):
+    def result(**options):
+        model = tiny_da3()
+        recipe = quick(model, steps=8, batch=2, dropout=0.1)
+        return run(model, [noise_scene(9), noise_scene(5, seed=1)], recipe, **options)
+
+    source = Path(adapting.__file__).parents[2]
+    path = [str(source), str(Path(__file__).parent.parent)]
+    program = PROGRAM.format(path=path, folder=str(tmp_path))
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.strip() == "5":
+                os.kill(process.pid, signal.SIGKILL)
+                break
+    assert [path for path in tmp_path.iterdir() if path.is_dir()]
+    steps = []
+    resumed = result(plan=Plan(place="disk"), resume_in=tmp_path, on_step=lambda progress: steps.append(progress.step))
+    whole = result()
+    assert steps == [5, 6, 7]
+    # What the killed process kept on disk is gone, too.
+    assert not [path for path in tmp_path.iterdir() if path.is_dir()]
+    assert resumed.curve == whole.curve
+    assert same(tensors(resumed), tensors(whole))
+
+
+@pytest.mark.parametrize("changed", ["seed", "recipe", "scenes"])
+def test_the_state_of_another_run_is_refused(changed, tmp_path, monkeypatch):
+    monkeypatch.setattr(adapting, "SAVE_EVERY_S", -1.0)
+    model = tiny_da3()
+    recipe = quick(model, steps=2)
+    run(model, [noise_scene(9)], recipe, resume_in=tmp_path).adapter.detach()
+    options = {"scenes": [noise_scene(9)], "recipe": recipe, "seed": 42}
+    options |= {
+        "seed": {"seed": 1},
+        "recipe": {"recipe": recipe.changed(lr=1.0)},
+        "scenes": {"scenes": [noise_scene(8)]},
+    }[changed]
+    with pytest.raises(UserError, match="belongs to another run"):
+        run(model, resume_in=tmp_path, **options)
+    # The refusal leaves no adapter behind.
+    Adapter.attach(model, rank=2, alpha=2, dropout=0.0, generator=torch.Generator())
+
+
+def test_a_damaged_state_is_refused(tmp_path):
+    (tmp_path / adapting.UNFINISHED_FILE).write_bytes(b"no tensors")
+    model = tiny_da3()
+    with pytest.raises(UserError, match="damaged state"):
+        run(model, [noise_scene(9)], quick(model), resume_in=tmp_path)

@@ -1,0 +1,163 @@
+"""What a step needs of a view set: made once, of the right views, decoded ahead of need, and gone after its last use."""
+
+import gc
+import threading
+import weakref
+
+import pytest
+import torch
+
+from freegeo.adaptation import samples as sampling
+from freegeo.adaptation.adapt import adapt
+from freegeo.adaptation.adapter import Adapter
+from freegeo.adaptation.recipe import released
+from freegeo.adaptation.samples import Samples, SceneImages, loaded_ahead
+from freegeo.adaptation.views import schedule
+from freegeo.errors import FreeGeoError, UserError
+from freegeo.models.api import embed_in_chunks
+from freegeo.models.precision import Compute
+from tiny_models import attach, noise, noise_scene, quick, tiny_da3, tiny_vggt
+
+CPU = torch.device("cpu")
+
+
+def opened(model, scenes, recipe, place="device", folder=None):
+    steps = schedule([scene.count for scene in scenes], recipe, seed=42)
+    samples = Samples(attach(model), scenes, recipe, steps, compute=Compute(), place=place, folder=folder, seed=42)
+    return samples, [visit for visits in steps for visit in visits]
+
+
+def recorded_scene(calls, views=9):
+    images = noise(views)
+
+    def load(frames):
+        calls.append((threading.current_thread().name, tuple(frames)))
+        return images[list(frames)]
+
+    return SceneImages(name="recorded", count=views, load=load)
+
+
+@pytest.mark.parametrize("build", [tiny_da3, tiny_vggt])
+@pytest.mark.parametrize("hold", [0.0, 1.0])
+@pytest.mark.parametrize("place", ["device", "disk"])
+def test_a_sample_is_the_frozen_model_s_view_of_its_set(build, hold, place, tmp_path):
+    model, scene = build(), noise_scene(9)
+    samples, visits = opened(model, [scene], quick(model, epochs=2, hold=hold), place, tmp_path)
+    with torch.no_grad():
+        for visit in visits:
+            sample, kept = samples.take(visit), list(visit.view_set.kept)
+            tokens = embed_in_chunks(model, scene.load(visit.view_set.frames), device=CPU)
+            levels = model.aggregate(tokens, layers=model.spec.loss_layers).levels
+            found, teacher = sample.student()
+            assert torch.equal(found.tokens, tokens.tokens[:, kept])
+            for layer, (patch, special) in levels.items():
+                assert torch.equal(teacher[layer][0], patch[:, kept])
+                assert torch.equal(teacher[layer][1], special[:, kept])
+            assert torch.equal(sample.held_out, levels[max(levels)][0][:, 1::2].flatten(1, 2))
+            assert sample.tokens.tokens.shape[1] == (8 if hold else 4)
+    samples.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_teacher_runs_once_per_distinct_view_set():
+    def passes(build, count, recipe):
+        model, seen = build(), []
+        # The frozen pass over all views is the one without gradients.
+        aggregate = model.aggregate
+        model.aggregate = lambda *args, **options: (
+            (None if torch.is_grad_enabled() else seen.append(args)) or aggregate(*args, **options)
+        )
+        adapt(model, [noise_scene(count)], recipe, seed=42)
+        return len(seen)
+
+    assert passes(tiny_da3, 9, quick(tiny_da3(), epochs=3, sets_per_scene=3, distinct_seeds=3)) == 3
+    assert passes(tiny_da3, 9, quick(tiny_da3(), epochs=3, sets_per_scene=3, distinct_seeds=3, hold=1.0)) == 3
+    # Four sets of a scene with 5 frames are the same 5 frames four times, even within one step.
+    assert passes(tiny_da3, 5, quick(tiny_da3(), epochs=2, sets_per_scene=4, distinct_seeds=4, batch=4)) == 1
+
+
+def test_a_sample_is_kept_from_its_first_visit_to_its_last():
+    """Memory does not grow with epochs, and recipes that draw anew keep nothing."""
+
+    def alive_after_each_visit(model, recipe):
+        samples, visits = opened(model, [noise_scene(9)], recipe)
+        seen, alive = [], []
+        for visit in visits:
+            seen.append(weakref.ref(samples.take(visit).held_out))
+            gc.collect()
+            alive.append(len({ref for ref in seen if ref() is not None}))
+        samples.close()
+        return alive
+
+    redrawn = released("released-vggt", "eth3d").changed(epochs=4, sets_per_scene=2, rank=2, batch=1)
+    assert alive_after_each_visit(tiny_vggt(), redrawn) == [0] * 8
+    assert alive_after_each_visit(tiny_da3(), quick(tiny_da3(), epochs=3, sets_per_scene=2, distinct_seeds=2)) == [
+        1, 2, 2, 2, 1, 0,
+    ]  # fmt: skip
+
+
+def test_a_view_s_tokens_do_not_depend_on_the_views_beside_it():
+    model, images = tiny_da3(), noise(9)
+    layers = model.spec.loss_layers
+    every = embed_in_chunks(model, images, device=CPU, layers=layers)
+    for number in (0, 4, 8):
+        alone = embed_in_chunks(model, images[number : number + 1], device=CPU, layers=layers)
+        assert torch.equal(every.tokens[:, number], alone.tokens[:, 0])
+
+
+def test_images_are_loaded_once_per_view_set_in_the_background():
+    calls, model = [], tiny_da3()
+    samples, visits = opened(model, [recorded_scene(calls)], quick(model, epochs=3))
+    for visit in visits:
+        samples.take(visit)
+    samples.close()
+    assert len(calls) == 3
+    assert all(name.startswith("freegeo-images") for name, _ in calls)
+
+
+def test_loading_runs_ahead_keeps_the_order_and_hands_errors_on():
+    model, calls, images = tiny_da3(), [], noise(9)
+    started = threading.Event()
+
+    def load(frames):
+        calls.append(tuple(frames))
+        if len(calls) == 2:
+            started.set()
+        if len(calls) == 3:
+            raise FreeGeoError("frame 8 is damaged")
+        return images[list(frames)]
+
+    scene = SceneImages(name="s", count=9, load=load)
+    sets = [visit.view_set for visits in schedule([9], quick(model), 0) for visit in visits][:3]
+    loaded = loaded_ahead([scene], sets)
+    assert torch.equal(next(loaded), images[list(sets[0].frames)])
+    assert started.wait(10)  # the second set is loaded although nobody has asked for it
+    assert torch.equal(next(loaded), images[list(sets[1].frames)])
+    with pytest.raises(FreeGeoError, match="frame 8"):
+        next(loaded)
+    assert calls == [view_set.frames for view_set in sets]
+
+
+def test_an_unreadable_image_stops_the_run_and_leaves_the_model_plain():
+    def load(frames):
+        if len(frames) > 1:
+            raise UserError("photo 3 cannot be read")
+        return noise(9)[list(frames)]
+
+    model = tiny_da3()
+    with pytest.raises(UserError, match="photo 3"):
+        adapt(model, [SceneImages(name="broken", count=9, load=load)], quick(model), seed=42)
+    assert not any(thread.name.startswith("freegeo-images") for thread in threading.enumerate())
+    Adapter.attach(model, rank=2, alpha=2, dropout=0.0, generator=torch.Generator())
+
+
+def test_a_folder_that_cannot_be_written_to_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot be written to"):
+        opened(model := tiny_da3(), [noise_scene(9)], quick(model), "disk", tmp_path / "file")
+
+
+def test_the_augmentation_is_a_function_of_the_seed():
+    images = noise(8)
+    assert torch.equal(sampling.released_augmentation(images, 41), sampling.released_augmentation(images, 41))
+    assert not torch.equal(sampling.released_augmentation(images, 41), sampling.released_augmentation(images, 42))
