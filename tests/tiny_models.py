@@ -4,8 +4,8 @@ import torch
 from torch import Tensor, nn
 
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.samples import SceneImages
 from freegeo.adaptation.recipe import Recipe, scene
+from freegeo.adaptation.samples import SceneImages
 from freegeo.models.api import AdaptationDefaults, ModelSpec, ReconstructionModel
 from freegeo.models.da3 import DA3, DA3Config
 from freegeo.models.vggt import VGGT, VGGTConfig

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from freegeo.adaptation.losses import feature_distance
 from freegeo.adaptation.adapt import adapt
+from freegeo.adaptation.losses import feature_distance
 from freegeo.errors import UserError
 from tiny_models import noise, noise_scene, quick, tiny_da3, tiny_vggt
 

@@ -1,4 +1,4 @@
-"""What a step needs of a view set: made once, of the right views, decoded ahead of need, and gone after its last use."""
+"""What a step needs of a view set: made once, of the right views, decoded ahead of need, gone after its last use."""
 
 import gc
 import threading

@@ -12,11 +12,10 @@ from PIL import Image
 from safetensors.torch import save_file
 
 import freegeo
-from freegeo.adaptation.adapter import count_trainable
-from freegeo.adaptation.adapter_files import load_adapter, save_adapter
-from freegeo.adaptation.adapter_files import export_published
-from freegeo.adaptation.recipe import released
 from freegeo.adaptation.adapt import adapt
+from freegeo.adaptation.adapter import count_trainable
+from freegeo.adaptation.adapter_files import export_published, load_adapter, save_adapter
+from freegeo.adaptation.recipe import released
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.models import catalog
 from freegeo.models.api import ReconstructionModel
