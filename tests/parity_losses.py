@@ -18,12 +18,10 @@ from freegeo.adaptation.losses import (
     StepDraws,
     TokenDraw,
     adaptation_loss,
-    paper_loss,
-    released_da3_loss,
-    released_vggt_loss,
     teacher_targets,
 )
 from freegeo.adaptation.losses.targets import anchor_positions
+from freegeo.adaptation.recipe import PAPER, RELEASED_DA3, RELEASED_VGGT
 
 Levels = dict[int, tuple[Tensor, Tensor]]
 WITHOUT_INTRA = {"weight_huber": 0.0, "weight_cosine": 0.0}
@@ -88,7 +86,7 @@ def _loss_and_gradients(
 
 
 def _released_config(family: str, recorded: dict) -> LossConfig:
-    config = released_da3_loss() if family == "da3" else released_vggt_loss()
+    config = (RELEASED_DA3 if family == "da3" else RELEASED_VGGT).loss
     w_pq, w_pk, w_kq = (recorded["weight_distance"] * weight for weight in recorded["distance_weights"])
     return replace(
         config,
@@ -187,7 +185,8 @@ def _check_paper(path: Path, dtype: torch.dtype) -> float:
     errors = []
     for temperature in recorded["temperatures"]:
         config = replace(
-            paper_loss(temperature=temperature),
+            PAPER.loss,
+            temperature=temperature,
             huber_delta=recorded["huber_delta"],
             num_anchors=recorded["num_anchors"],
             num_reference=recorded["num_ref"],

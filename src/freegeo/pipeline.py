@@ -20,7 +20,7 @@ from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.adapter_files import PAGE, load_adapter, save_adapter
 from freegeo.adaptation.bank import SceneImages
 from freegeo.adaptation.planner import choose_adaptation, plan_reconstruction
-from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
+from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Recipe
 from freegeo.adaptation.trainer import STATE_FILE, Adapted, Engine, Progress
 from freegeo.adaptation.trainer import adapt as train_adapter
 from freegeo.errors import UserError
@@ -44,7 +44,6 @@ SUMMARY_NAME = "reconstruction.json"
 FROZEN_FOLDER, ADAPTER_FOLDER = "frozen", "adapter"
 FORMATS = ("ply", "glb")
 VIEWS_PER_CHUNK = 8
-SEED = 43
 
 
 @torch.no_grad()

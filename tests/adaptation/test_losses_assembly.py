@@ -9,23 +9,21 @@ from freegeo.adaptation.losses import (
     TeacherTargets,
     adaptation_loss,
     anchor_features,
-    choose_precision,
+    choose_form,
     draw_tokens,
-    paper_loss,
-    released_da3_loss,
-    released_vggt_loss,
     require_finite,
     teacher_spread,
     teacher_targets,
 )
 from freegeo.adaptation.losses.sampling import search_anchors
+from freegeo.adaptation.recipe import PAPER, RELEASED_DA3, RELEASED_VGGT
 from freegeo.errors import FreeGeoError, UserError
 
 KEPT = [0, 2, 4, 6]
 CONFIGS = {
-    "paper": paper_loss(temperature=10.0),
-    "released-da3": released_da3_loss(),
-    "released-vggt": released_vggt_loss(),
+    "paper": PAPER.loss,
+    "released-da3": RELEASED_DA3.loss,
+    "released-vggt": RELEASED_VGGT.loss,
 }
 
 
@@ -126,13 +124,13 @@ def test_half_features_and_autocast_compute_in_float32(config):
         torch.testing.assert_close(half.float(), full, rtol=2e-2, atol=1e-5)
 
 
-def test_a_given_precision_equals_the_measured_one():
+def test_a_given_form_equals_the_measured_one():
     config = CONFIGS["paper"]
     student, teacher = features()
     draws = draws_for(config)
     spread = teacher_spread(teacher_targets(teacher, KEPT, draws, config), draws, config)
     measured, _ = loss_and_gradient(student, teacher, config)
-    given, _ = loss_and_gradient(student, teacher, config, precision=choose_precision(float(spread), headroom=1.25))
+    given, _ = loss_and_gradient(student, teacher, config, form=choose_form(float(spread), headroom=1.25))
     assert all(measured[name] == given[name] for name in measured)
 
 
@@ -231,9 +229,16 @@ def test_what_cannot_work_is_refused():
     config = CONFIGS["paper"]
     draws = draws_for(config)
     with pytest.raises(UserError, match="temperature must be positive"):
-        paper_loss(temperature=0.0)
+        replace(config, temperature=0.0)
     with pytest.raises(UserError, match="needs pairing 'paired'"):
         replace(config, distance_mode="huber")
+    with pytest.raises(UserError, match="selection is one of mixed, topk, random, not best"):
+        replace(config, selection="best")
+    with pytest.raises(UserError, match="3 numbers, one for each angle"):
+        replace(config, angle_weights=(1.0, 1.0))
+    for weights in ({"weight_kq": -1.0}, {"weight_huber": float("nan")}, {"angle_weights": (1.0, -1.0, 1.0)}):
+        with pytest.raises(UserError, match="weights must be 0 or more"):
+            replace(config, **weights)
     with pytest.raises(UserError, match="at least 3 views"):
         draw_tokens(config, tokens_per_view=4, student_views=2, held_out_views=0, generator=torch.Generator())
     with pytest.raises(UserError, match="reference_view is 9"):
@@ -253,12 +258,12 @@ def test_what_cannot_work_is_refused():
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS.keys())
-@pytest.mark.parametrize("precision", ["float64", "direct"])
-def test_blocks_do_not_change_the_loss(monkeypatch, config, precision):
+@pytest.mark.parametrize("form", ["float64", "direct"])
+def test_blocks_do_not_change_the_loss(monkeypatch, config, form):
     student, teacher = features(dtype=torch.float64)
-    whole, whole_grads = loss_and_gradient(student, teacher, config, precision=precision)
+    whole, whole_grads = loss_and_gradient(student, teacher, config, form=form)
     monkeypatch.setattr("freegeo.adaptation.losses.numerics.CPU_BLOCK_ELEMENTS", 300)
-    parts, part_grads = loss_and_gradient(student, teacher, config, precision=precision)
+    parts, part_grads = loss_and_gradient(student, teacher, config, form=form)
     for name, value in whole.items():
         torch.testing.assert_close(parts[name], value)
     torch.testing.assert_close(part_grads, whole_grads)

@@ -16,12 +16,13 @@ from freegeo.adaptation.cache import TensorCache
 from freegeo.adaptation.engine import Engine
 from freegeo.adaptation.losses import (
     AnchorFeatures,
+    KLForm,
+    Level,
     LossConfig,
-    Precision,
     StepDraws,
     TeacherTargets,
     anchor_features,
-    choose_precision,
+    choose_form,
     draw_tokens,
     teacher_spread,
     teacher_targets,
@@ -31,7 +32,6 @@ from freegeo.adaptation.views import ViewSet, Visit
 from freegeo.models.api import ReconstructionModel
 from freegeo.types import ViewTokens
 
-Level = tuple[Tensor, Tensor]
 DRAW_SEED_STRIDE = 1_000_003
 SPREAD_HEADROOM = 2.0
 """How far the student's softmax inputs may spread beyond the teacher's, where they are measured once per view set."""
@@ -43,7 +43,7 @@ class Comparison:
 
     targets: TeacherTargets
     draws: StepDraws
-    precision: Precision | None
+    precision: KLForm | None
     """How the all-pairs KL is computed; None: the loss measures it, which costs a host read."""
     views: int
     """Views that the teacher saw."""
@@ -107,7 +107,7 @@ class TeacherBank:
             "targets", engine.cache_place, engine.device, folder=engine.cache_folder, half=engine.half_cache
         )
         self._entries: dict[SetKey, _Entry] = {}
-        self._precisions: dict[SetKey, Precision | None] = {}
+        self._precisions: dict[SetKey, KLForm | None] = {}
         self._steps: dict[SetKey, list[int]] = {}
         for visit in visits:
             self._steps.setdefault(set_key(visit.view_set, recipe), []).append(visit.step)
@@ -192,11 +192,11 @@ class TeacherBank:
             targets=targets, draws=draws, precision=self._precisions[key], views=len(visit.view_set.frames)
         )
 
-    def _precision(self, targets: TeacherTargets, draws: StepDraws) -> Precision | None:
+    def _precision(self, targets: TeacherTargets, draws: StepDraws) -> KLForm | None:
         """On the CPU nothing waits for a host read, so every step measures; elsewhere the teacher's stands for all."""
         if self.engine.device.type == "cpu" or not self.config.uses_distances or self.config.pairing != "all":
             return None
-        return choose_precision(float(teacher_spread(targets, draws, self.config)), headroom=SPREAD_HEADROOM)
+        return choose_form(float(teacher_spread(targets, draws, self.config)), headroom=SPREAD_HEADROOM)
 
 
 def _levels(tensors: Mapping[str, Tensor]) -> dict[int, Level]:
@@ -231,7 +231,7 @@ def stacked(comparisons: Sequence[Comparison]) -> Comparison:
     )
 
 
-def _safest(precisions: Sequence[Precision | None]) -> Precision | None:
+def _safest(precisions: Sequence[KLForm | None]) -> KLForm | None:
     for precision in ("direct", "float64", "float32"):
         if precision in precisions:
             return precision

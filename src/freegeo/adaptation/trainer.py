@@ -19,7 +19,7 @@ from freegeo.adaptation.dropout import pack_dropout
 from freegeo.adaptation.engine import Engine
 from freegeo.adaptation.images import SceneImages
 from freegeo.adaptation.losses import adaptation_loss, feature_distance, require_finite
-from freegeo.adaptation.recipe import Recipe
+from freegeo.adaptation.recipe import PAPER_SEED, Recipe
 from freegeo.adaptation.state import read_state, run_identity, write_state
 from freegeo.adaptation.teacher import Comparison, TeacherBank, loss_features, stacked
 from freegeo.adaptation.views import Visit, schedule
@@ -79,7 +79,7 @@ def adapt(
     scenes: Sequence[SceneImages],
     recipe: Recipe,
     *,
-    seed: int = 42,
+    seed: int = PAPER_SEED,
     engine: Engine | None = None,
     resume_in: Path | None = None,
     on_step: Callable[[Progress], None] = lambda progress: None,
@@ -238,7 +238,7 @@ class _Run:
         with self.arithmetic():
             levels = loss_features(self.adapter.model, tokens)
         return adaptation_loss(
-            levels, comparison.targets, comparison.draws, self.recipe.loss, precision=comparison.precision
+            levels, comparison.targets, comparison.draws, self.recipe.loss, form=comparison.precision
         )
 
     def _hold(self, visit: Visit) -> tuple[Tensor, dict[str, Tensor]]:

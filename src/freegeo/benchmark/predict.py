@@ -18,7 +18,7 @@ from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.bank import embed_in_chunks
 from freegeo.adaptation.engine import Engine
-from freegeo.adaptation.recipe import Recipe
+from freegeo.adaptation.recipe import PAPER_SEED, Recipe
 from freegeo.adaptation.trainer import Progress
 from freegeo.benchmark.adapters import AdapterJob, peak_memory_gb, reset_peak_memory, train, use
 from freegeo.benchmark.frames import require_truth
@@ -66,7 +66,7 @@ class Setup:
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the recipe that are replaced, as in `Recipe.changed`."""
     adapt_per: AdaptPer = "dataset"
-    adapt_seed: int = 42
+    adapt_seed: int = PAPER_SEED
     epoch: int | None = None
     """Which epoch's adapter predicts; None: the last."""
     given_cameras: bool = False
