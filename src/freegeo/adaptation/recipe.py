@@ -90,11 +90,9 @@ class LossConfig:
         weights = (self.weight_huber, self.weight_cosine, self.weight_pk, self.weight_pq, self.weight_kq)
         if not all(weight >= 0 for weight in (*weights, *self.angle_weights)):
             raise UserError("Loss weights must be 0 or more.")
-        for name, kind in get_type_hints(type(self)).items():
-            if get_origin(kind) is Literal and getattr(self, name) not in get_args(kind):
-                raise UserError(
-                    f"Loss setting {name} is one of {', '.join(get_args(kind))}, not {getattr(self, name)}."
-                )
+        for name, choices in _LOSS_CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise UserError(f"Loss setting {name} is one of {', '.join(choices)}, not {getattr(self, name)}.")
         if len(self.angle_weights) != 3:
             raise UserError(f"Loss setting angle_weights has 3 numbers, one for each angle, not {self.angle_weights}.")
         if self.distance_mode == "huber" and self.pairing == "all":
@@ -117,6 +115,11 @@ class LossConfig:
             if name not in known:
                 raise UserError(f"There is no loss setting '{name}'; known are {', '.join(known)}.")
         return replace(self, **changes)
+
+
+_LOSS_CHOICES = {
+    name: get_args(kind) for name, kind in get_type_hints(LossConfig).items() if get_origin(kind) is Literal
+}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -110,7 +110,7 @@ class RecipeOptions:
     """Rank of the adapter."""
     hold: float | None = None
     """Weight of keeping what the model says with all views as it is (0: the paper; 1 where more views get worse)."""
-    loss: tuple[str, ...] = ()
+    loss: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     """Settings of the loss, such as weight_kq=0 or selection=topk,angle_weights=2,2,2; may be given several times."""
 
     def build(self, spec: ModelSpec) -> Recipe:
