@@ -87,7 +87,7 @@ class LossConfig:
         ):
             if not getattr(self, name) > 0:
                 raise UserError(f"Loss setting {name} must be positive, not {getattr(self, name)}.")
-        weights = (self.weight_huber, self.weight_cosine, self.weight_pk, self.weight_pq, self.weight_kq)
+        weights = [getattr(self, field.name) for field in fields(self) if field.name.startswith("weight_")]
         if not all(weight >= 0 for weight in (*weights, *self.angle_weights)):
             raise UserError("Loss weights must be 0 or more.")
         for name, choices in _LOSS_CHOICES.items():

@@ -8,11 +8,12 @@ since the squared sides of a triangle give its angles:
     cosines   n / sqrt(a b)  at p        (b - n) / sqrt(b c)  at k        (a - n) / sqrt(a c)  at q
 
 Why edges, and not k . q for c: an anchor is often close to its reference, and a short side that is the difference of
-large squared norms has lost its digits. The edge u is subtracted first, so b and n are exact. a and c still are such
-differences; two things keep them right. All tokens are centred on a common vector, which changes no side but makes the
-norms small. And where the two tokens of a side are equal (repeated frames), what is left of it is rounding, which must
-not be taken for a direction: `_branch` says below which length a side counts as zero; its cosines are 0 and take no
-gradient. The bound is that of the inputs' type, so the products must be exact (`exact_matmul`).
+large squared norms has lost its digits. The edge u is subtracted first, so a short one keeps its digits, and so do b
+and n. For a and c, which still are such differences, two things help. All tokens are centred on a common vector, which
+changes no side but makes the norms small. And where the two tokens of a side are equal (repeated frames), what is left
+of it is rounding, which must not be taken for a direction: `_branch` says below which length a side counts as zero; its
+cosines are 0 and take no gradient. The bound is that of the inputs' type, so the products must be exact
+(`exact_matmul`).
 
 Loss and gradient come from one sweep over blocks of references that stay in cache; two arrays of R * K * m live during
 the sweep and none after it. Gradients go first to a, b and n (`_by_squares`), then, by further products, to p and q

@@ -2,10 +2,10 @@
 
 All pairs (x, y) of two token sets, here already divided by tau, would take R * m softmaxes over C channels. Since
 exp(x - y) = exp(x) exp(-y), matrix products of the tokens' exponentials E = exp(x) and F = exp(-y) do the same work.
-With the marks of the teacher, * element by element and g the weight of every pair in the loss,
+A prime marks the teacher's tokens, * multiplies element by element, and g is the weight of each pair in the loss:
 
-    Z      = E F^T                                       the partition functions of all pairs (R, m)
-    pi_c   = E_c F_c / Z,   log pi_c = x_c - y_c - log Z
+    Z      = E F^T                                                    the partition functions of all pairs, (R, m)
+    pi_c   = E_c F_c / Z,   log pi_c = x_c - y_c - log Z              one pair, channel c
     KL     = sum over c of pi'_c (log pi'_c - log pi_c)
            = [ (E' * (x' - x)) F'^T + E' (F' * (y - y'))^T ] / Z' - log Z' + log Z
     dKL/dx = sum over y of g (pi - pi') = E * ((g / Z) F) - E' * ((g / Z') F'),   and dKL/dy likewise
@@ -13,7 +13,7 @@ With the marks of the teacher, * element by element and g the weight of every pa
 In place of E the code holds E / max E, likewise F, and adds the logarithms of the maxima to log Z: nothing overflows.
 What can go wrong is underflow: Z is lost where no channel is large in both factors. With centred tokens (`_centred`)
 it is at least C exp(-S) for the spread S that `pair_spread` measures, so S decides between float32, float64 and the
-definition. Less than float32 is never used: KL is a small difference of large logarithms.
+definition. Half precision is never used: KL is a small difference of large logarithms.
 Source: docs/method.md, "Divergence by matrix products" and "Range and precision".
 
 Chosen pairs (`pairing` "paired") are too few for that and are evaluated from the definition, as `equations` has it.
