@@ -17,9 +17,9 @@ import torch
 from plain import angle_loss as plain_angle_loss
 from record import write_result
 
+from freegeo.adaptation.losses.angles import angle_loss
 from freegeo.adaptation.losses.divergence import all_pairs_divergence
 from freegeo.adaptation.losses.intra import intra_loss
-from freegeo.adaptation.losses.relational import angle_loss
 
 REFERENCES, QUERIES, ANCHORS, PART = 256, 768, 4, 16
 
@@ -56,7 +56,7 @@ def measure(channels: int) -> dict:
     _, part_value, part_grad = timed(lambda: matrix(few_p, few_q), [p, q])
     full_s, _, _ = timed(lambda: matrix(REFERENCES, QUERIES), [p, q], 3)
     kl_s, _, _ = timed(
-        lambda: all_pairs_divergence((p[None], q[None]), (tp[None], tq[None]), temperature=10.0, precision=None).mean(),
+        lambda: all_pairs_divergence((p[None], q[None]), (tp[None], tq[None]), temperature=10.0, form=None).mean(),
         [p, q],
         3,
     )

@@ -18,12 +18,11 @@ from freegeo.adaptation.losses import (
     StepDraws,
     TokenDraw,
     adaptation_loss,
-    paper_loss,
-    released_da3_loss,
-    released_vggt_loss,
-    teacher_targets,
+    held_out_tokens,
 )
 from freegeo.adaptation.losses.targets import anchor_positions
+from freegeo.adaptation.recipe import PAPER, RELEASED_DA3, RELEASED_VGGT
+from loss_tools import kept_levels, targets_of
 
 Levels = dict[int, tuple[Tensor, Tensor]]
 WITHOUT_INTRA = {"weight_huber": 0.0, "weight_cosine": 0.0}
@@ -69,6 +68,11 @@ def _anchor_error(found: Tensor, wanted: Tensor) -> float:
     return 0.0 if torch.equal(found.sort(dim=-1).values, wanted.long().sort(dim=-1).values) else torch.inf
 
 
+def _found_anchors(level: tuple[Tensor, Tensor], kept: list[int], draw: TokenDraw, config: LossConfig) -> Tensor:
+    (views,) = kept_levels({0: level}, kept).values()
+    return anchor_positions(views, held_out_tokens(level, kept, config), replace(draw, anchor=None), config)
+
+
 def _split(features: Tensor, special_tokens: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     features = features.to(dtype)
     return features[:, :, special_tokens:].clone(), features[:, :, :special_tokens].clone()
@@ -79,7 +83,7 @@ def _loss_and_gradients(
 ) -> tuple[dict[str, Tensor], dict[int, Tensor]]:
     """Terms, and per layer the gradient of the total over [special tokens, patches] (B, M, T + P, C)."""
     inputs = {layer: tuple(part.clone().requires_grad_() for part in level) for layer, level in levels.items()}
-    total, terms = adaptation_loss(inputs, teacher_targets(teacher, kept, draws, config), draws, config)
+    total, terms = adaptation_loss(inputs, targets_of(teacher, kept, draws, config), draws, config)
     total.backward()
     zero = {
         layer: [torch.zeros_like(p) if p.grad is None else p.grad for p in parts] for layer, parts in inputs.items()
@@ -88,7 +92,7 @@ def _loss_and_gradients(
 
 
 def _released_config(family: str, recorded: dict) -> LossConfig:
-    config = released_da3_loss() if family == "da3" else released_vggt_loss()
+    config = (RELEASED_DA3 if family == "da3" else RELEASED_VGGT).loss
     w_pq, w_pk, w_kq = (recorded["weight_distance"] * weight for weight in recorded["distance_weights"])
     return replace(
         config,
@@ -137,7 +141,7 @@ def _check_released(path: Path, dtype: torch.dtype) -> float:
     errors = []
     if config.selection != "random":
         for name, draw in (("angle", draws.angle), ("distance", draws.distance)):
-            found = anchor_positions(teacher[last], kept, replace(draw, anchor=None), config)
+            found = _found_anchors(teacher[last], kept, draw, config)
             errors.append(_anchor_error(found, expected[f"index.{name}.anchor"]))
 
     def compare(found: Tensor, name: str) -> None:
@@ -187,14 +191,15 @@ def _check_paper(path: Path, dtype: torch.dtype) -> float:
     errors = []
     for temperature in recorded["temperatures"]:
         config = replace(
-            paper_loss(temperature=temperature),
+            PAPER.loss,
+            temperature=temperature,
             huber_delta=recorded["huber_delta"],
             num_anchors=recorded["num_anchors"],
             num_reference=recorded["num_ref"],
             num_query=recorded["num_query"],
             reference_view=recorded["ref_view"],
         )
-        found = anchor_positions(teacher[0], kept, replace(draw, anchor=None), config)
+        found = _found_anchors(teacher[0], kept, draw, config)
         errors.append(_anchor_error(found, expected["index.anchor"]))
         errors += _paper_errors(expected, f"tau{temperature:g}", run, config, dtype)
     return _worst(errors)

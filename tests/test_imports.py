@@ -44,7 +44,10 @@ def call(*arguments: str) -> str:
     [
         pytest.param("import freegeo; dir(freegeo); freegeo.__version__", id="import freegeo"),
         pytest.param("import freegeo.cli.app", id="import freegeo.cli.app"),
-        pytest.param("import freegeo.run_folder, freegeo.errors, freegeo.models.catalog", id="import light rooms"),
+        pytest.param(
+            "import freegeo.run_folder, freegeo.errors, freegeo.models.catalog, freegeo.adaptation.recipe",
+            id="import light rooms",
+        ),
         pytest.param(call("--help"), id="freegeo --help"),
         pytest.param(call("--version"), id="freegeo --version"),
         pytest.param(call("run", "--help"), id="freegeo run --help"),

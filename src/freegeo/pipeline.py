@@ -20,7 +20,7 @@ from freegeo.adaptation.adapt import adapt as train_adapter
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.adapter_files import METADATA, load_adapter
 from freegeo.adaptation.memory import plan_reconstruction
-from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
+from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Recipe
 from freegeo.adaptation.samples import SceneImages
 from freegeo.errors import UserError
 from freegeo.export.formats import export, filter_reconstruction
@@ -43,7 +43,6 @@ logger = logging.getLogger(__name__)
 SUMMARY_NAME = "reconstruction.json"
 FROZEN_FOLDER, ADAPTER_FOLDER = "frozen", "adapter"
 FORMATS = ("ply", "glb")
-SEED = 43
 CPU = Compute()
 
 

@@ -1,4 +1,4 @@
-"""Draws, teacher targets and the assembled loss: what takes part, what is stored, and how gradients behave."""
+"""Draws, teacher targets and the assembled loss: what takes part and how gradients behave."""
 
 from dataclasses import FrozenInstanceError, replace
 
@@ -6,26 +6,22 @@ import pytest
 import torch
 
 from freegeo.adaptation.losses import (
-    TeacherTargets,
     adaptation_loss,
-    anchor_features,
-    choose_precision,
+    choose_form,
     draw_tokens,
-    paper_loss,
-    released_da3_loss,
-    released_vggt_loss,
     require_finite,
     teacher_spread,
-    teacher_targets,
 )
 from freegeo.adaptation.losses.sampling import search_anchors
+from freegeo.adaptation.recipe import PAPER, RELEASED_DA3, RELEASED_VGGT
 from freegeo.errors import FreeGeoError, UserError
+from loss_tools import targets_of
 
 KEPT = [0, 2, 4, 6]
 CONFIGS = {
-    "paper": paper_loss(temperature=10.0),
-    "released-da3": released_da3_loss(),
-    "released-vggt": released_vggt_loss(),
+    "paper": PAPER.loss,
+    "released-da3": RELEASED_DA3.loss,
+    "released-vggt": RELEASED_VGGT.loss,
 }
 
 
@@ -51,7 +47,7 @@ def draws_for(config, seed=1, special=3):
 
 def loss_and_gradient(student, teacher, config, scale=1.0, **settings):
     draws = draws_for(config)
-    loss, terms = adaptation_loss(student, teacher_targets(teacher, KEPT, draws, config), draws, config, **settings)
+    loss, terms = adaptation_loss(student, targets_of(teacher, KEPT, draws, config), draws, config, **settings)
     inputs = [part for level in student.values() for part in level]
     found = torch.autograd.grad(scale * loss, inputs, allow_unused=True)
     return terms, [torch.zeros_like(part) if grad is None else grad for part, grad in zip(inputs, found, strict=True)]
@@ -62,7 +58,7 @@ def test_student_that_equals_the_teacher_has_no_loss(config):
     _, teacher = features()
     student = {layer: tuple(part[:, KEPT].clone() for part in level) for layer, level in teacher.items()}
     draws = draws_for(config)
-    _, terms = adaptation_loss(student, teacher_targets(teacher, KEPT, draws, config), draws, config)
+    _, terms = adaptation_loss(student, targets_of(teacher, KEPT, draws, config), draws, config)
     assert all(abs(term) < 1e-6 for term in terms.values())
 
 
@@ -100,7 +96,7 @@ def test_gradient_is_linear_in_the_scale_and_survives_a_second_pass(config):
     for small, large in zip(once, scaled, strict=True):
         torch.testing.assert_close(65536.0 * small, large)
     draws = draws_for(config)
-    loss, _ = adaptation_loss(student, teacher_targets(teacher, KEPT, draws, config), draws, config)
+    loss, _ = adaptation_loss(student, targets_of(teacher, KEPT, draws, config), draws, config)
     loss.backward(retain_graph=True)
     loss.backward()
     for part, single in zip((part for level in student.values() for part in level), once, strict=True):
@@ -126,13 +122,13 @@ def test_half_features_and_autocast_compute_in_float32(config):
         torch.testing.assert_close(half.float(), full, rtol=2e-2, atol=1e-5)
 
 
-def test_a_given_precision_equals_the_measured_one():
+def test_a_given_form_equals_the_measured_one():
     config = CONFIGS["paper"]
     student, teacher = features()
     draws = draws_for(config)
-    spread = teacher_spread(teacher_targets(teacher, KEPT, draws, config), draws, config)
+    spread = teacher_spread(targets_of(teacher, KEPT, draws, config), draws, config)
     measured, _ = loss_and_gradient(student, teacher, config)
-    given, _ = loss_and_gradient(student, teacher, config, precision=choose_precision(float(spread), headroom=1.25))
+    given, _ = loss_and_gradient(student, teacher, config, form=choose_form(float(spread), headroom=1.25))
     assert all(measured[name] == given[name] for name in measured)
 
 
@@ -160,7 +156,7 @@ def test_random_anchors_are_part_of_the_draw():
     student, teacher = features()
     draws = draws_for(config)
     assert draws.angle.anchor.shape == (20, 4) and int(draws.angle.anchor.max()) < 80
-    targets = teacher_targets(teacher, KEPT, draws, config)
+    targets = targets_of(teacher, KEPT, draws, config)
     held_out = teacher[11][0][:, 1::2].flatten(1, 2)
     assert torch.equal(targets.anchors.angle, held_out[:, draws.angle.anchor])
     assert torch.isfinite(adaptation_loss(student, targets, draws, config)[0])
@@ -184,39 +180,16 @@ def test_anchors_do_not_depend_on_the_size_of_the_blocks(monkeypatch):
     assert torch.equal(search_anchors(reference, held_out, num_anchors=4, selection="mixed"), whole)
 
 
-@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS.keys())
-def test_targets_survive_storage_and_store_only_what_is_read(config):
-    student, teacher = features()
-    draws = draws_for(config)
-    targets = teacher_targets(teacher, KEPT, draws, config)
-    stored = targets.tensors()
-    special = {"paper": 1, "released-da3": 0, "released-vggt": 3}
-    name = next(name for name, value in CONFIGS.items() if value is config)
-    per_layer = 2 * 4 * (20 + special[name]) * 24
-    anchors = len([key for key in stored if key.startswith("anchors")]) * draws.angle.reference.numel() * 2 * 4 * 24
-    assert sum(tensor.untyped_storage().nbytes() for tensor in stored.values()) == 4 * (2 * per_layer + anchors)
-    loss, _ = adaptation_loss(student, targets, draws, config)
-    again, _ = adaptation_loss(student, TeacherTargets.from_tensors(stored), draws, config)
-    assert loss == again
-
-
-def test_evenly_spaced_views_are_not_copied_and_others_are_right():
+def test_anchors_are_those_of_the_draw():
     _, teacher = features()
     config = CONFIGS["released-da3"]
     draws = draws_for(config)
-    even, uneven = (teacher_targets(teacher, kept, draws, config).kept[5][0] for kept in (KEPT, [0, 1, 4, 6]))
-    assert even.untyped_storage().data_ptr() == teacher[5][0].untyped_storage().data_ptr()
-    assert torch.equal(uneven, teacher[5][0][:, [0, 1, 4, 6]])
-
-
-def test_anchors_of_another_draw_replace_those_of_the_first():
-    student, teacher = features()
-    config = CONFIGS["paper"]
-    first, second = draws_for(config), draws_for(config, seed=2)
-    targets = teacher_targets(teacher, KEPT, first, config)
-    moved = replace(targets, anchors=anchor_features(teacher[11], KEPT, second, config))
-    whole = teacher_targets(teacher, KEPT, second, config)
-    assert adaptation_loss(student, moved, second, config)[0] == adaptation_loss(student, whole, second, config)[0]
+    held_out = teacher[11][0][:, 1::2].flatten(1, 2)
+    for draw, found in zip(
+        (draws.angle, draws.distance), vars(targets_of(teacher, KEPT, draws, config).anchors).values()
+    ):
+        wanted = search_anchors(teacher[11][0][:, 0, draw.reference], held_out, num_anchors=4, selection="mixed")
+        assert all(torch.equal(found[b], held_out[b][wanted[b]]) for b in range(2))
 
 
 def test_require_finite_names_the_term_and_the_step():
@@ -231,9 +204,16 @@ def test_what_cannot_work_is_refused():
     config = CONFIGS["paper"]
     draws = draws_for(config)
     with pytest.raises(UserError, match="temperature must be positive"):
-        paper_loss(temperature=0.0)
+        replace(config, temperature=0.0)
     with pytest.raises(UserError, match="needs pairing 'paired'"):
         replace(config, distance_mode="huber")
+    with pytest.raises(UserError, match="selection is one of mixed, topk, random, not best"):
+        replace(config, selection="best")
+    with pytest.raises(UserError, match="3 numbers, one for each angle"):
+        replace(config, angle_weights=(1.0, 1.0))
+    for weights in ({"weight_kq": -1.0}, {"weight_huber": float("nan")}, {"angle_weights": (1.0, -1.0, 1.0)}):
+        with pytest.raises(UserError, match="weights must be 0 or more"):
+            replace(config, **weights)
     with pytest.raises(UserError, match="at least 3 views"):
         draw_tokens(config, tokens_per_view=4, student_views=2, held_out_views=0, generator=torch.Generator())
     with pytest.raises(UserError, match="reference_view is 9"):
@@ -245,20 +225,20 @@ def test_what_cannot_work_is_refused():
             generator=torch.Generator(),
         )
     with pytest.raises(UserError, match="keeps every view"):
-        teacher_targets(teacher, list(range(8)), draws, config)
+        targets_of(teacher, list(range(8)), draws, config)
     with pytest.raises(FreeGeoError, match="same layers"):
-        adaptation_loss({5: student[5]}, teacher_targets(teacher, KEPT, draws, config), draws, config)
+        adaptation_loss({5: student[5]}, targets_of(teacher, KEPT, draws, config), draws, config)
     with pytest.raises(FrozenInstanceError):
         config.temperature = 2.0
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS.keys())
-@pytest.mark.parametrize("precision", ["float64", "direct"])
-def test_blocks_do_not_change_the_loss(monkeypatch, config, precision):
+@pytest.mark.parametrize("form", ["float64", "direct"])
+def test_blocks_do_not_change_the_loss(monkeypatch, config, form):
     student, teacher = features(dtype=torch.float64)
-    whole, whole_grads = loss_and_gradient(student, teacher, config, precision=precision)
+    whole, whole_grads = loss_and_gradient(student, teacher, config, form=form)
     monkeypatch.setattr("freegeo.adaptation.losses.numerics.CPU_BLOCK_ELEMENTS", 300)
-    parts, part_grads = loss_and_gradient(student, teacher, config, precision=precision)
+    parts, part_grads = loss_and_gradient(student, teacher, config, form=form)
     for name, value in whole.items():
         torch.testing.assert_close(parts[name], value)
     torch.testing.assert_close(part_grads, whole_grads)

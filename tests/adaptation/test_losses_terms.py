@@ -1,29 +1,23 @@
-"""Each term against its definition, and the custom gradients against finite differences."""
+"""Each fast term against the equations, and the custom gradients against finite differences."""
 
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-sys.path.append(str(Path(__file__).parent))
-
-import losses_reference as reference
-
 from freegeo.adaptation.losses import (
     adaptation_loss,
-    choose_precision,
+    choose_form,
     draw_tokens,
-    paper_loss,
-    released_vggt_loss,
-    teacher_targets,
+    equations,
 )
+from freegeo.adaptation.losses.angles import angle_loss
 from freegeo.adaptation.losses.divergence import all_pairs_divergence, pair_spread, paired_divergence
 from freegeo.adaptation.losses.intra import intra_loss
-from freegeo.adaptation.losses.relational import angle_loss
+from freegeo.adaptation.recipe import PAPER, RELEASED_VGGT
+from loss_tools import targets_of
 
 FLOAT64 = torch.float64
 
@@ -37,6 +31,23 @@ def random_triplets(batch=2, references=5, anchors=3, queries=7, channels=6, see
     p, q = normal(batch, references, channels), normal(batch, queries, channels)
     k = normal(batch, references, anchors, channels)
     return (p + 0.1 * normal(*p.shape), q + 0.1 * normal(*q.shape)), (p, q), k
+
+
+def angle_means(
+    student: tuple[Tensor, Tensor], teacher: tuple[Tensor, Tensor], k: Tensor, delta: float | None
+) -> Tensor:
+    """Mean penalties (3,) at p, k and q over all triplets; delta None is L1, as in the paper."""
+    mine, others = (
+        equations.phi(p[:, :, None, None], k[:, :, :, None], q[:, None, None]) for p, q in (student, teacher)
+    )
+    penalties = (mine - others).abs() if delta is None else equations.huber(mine - others, delta)
+    return penalties.mean((0, 1, 2, 3))
+
+
+def all_pairs_kl(student: tuple[Tensor, Tensor], teacher: tuple[Tensor, Tensor], temperature: float) -> Tensor:
+    """KL (B, R, m) of every pair."""
+    mine, others = (equations.log_pi(x[:, :, None], y[:, None], temperature) for x, y in (student, teacher))
+    return equations.kl(others, mine)
 
 
 def gradients(loss: Tensor, inputs: tuple[Tensor, ...]) -> list[Tensor]:
@@ -56,7 +67,7 @@ def test_angles_equal_their_definition(penalty, shape):
     inputs = tuple(part.requires_grad_() for part in student)
     weights = (1.0, 0.5, 2.0)
     found, terms = angle_loss(inputs, teacher, k, weights=weights, penalty=penalty, huber_delta=0.1)
-    means = reference.angle_means(inputs, teacher, k, None if penalty == "l1" else 0.1)
+    means = angle_means(inputs, teacher, k, None if penalty == "l1" else 0.1)
     torch.testing.assert_close(terms, means.detach(), rtol=1e-10, atol=1e-12)
     assert_same_loss(found, (torch.tensor(weights, dtype=FLOAT64) * means).sum(), inputs, 1e-9)
 
@@ -81,66 +92,66 @@ def test_zero_length_sides_give_cosine_zero_and_no_gradient(dtype):
     inputs = (p.requires_grad_(), q.requires_grad_())
     found, terms = angle_loss(inputs, (tp, tq), k, weights=(1.0, 1.0, 1.0), penalty="huber", huber_delta=1.0)
     wide = tuple(part.detach().double().requires_grad_() for part in inputs)
-    means = reference.angle_means(wide, (tp.double(), tq.double()), k.double(), 1.0)
+    means = angle_means(wide, (tp.double(), tq.double()), k.double(), 1.0)
     tolerance = 1e-5 if dtype == torch.float32 else 1e-9
     torch.testing.assert_close(terms.double(), means.detach(), rtol=tolerance, atol=tolerance)
     for mine, plain in zip(gradients(found, inputs), gradients(means.sum(), wide), strict=True):
         assert (mine.double() - plain).norm() <= tolerance * plain.norm()
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64", "direct", None])
+@pytest.mark.parametrize("form", ["float32", "float64", "direct", None])
 @pytest.mark.parametrize("shared", ["nothing", "x", "y"])
-def test_all_pairs_divergence_equals_its_definition(precision, shared):
+def test_all_pairs_divergence_equals_its_definition(form, shared):
     (x, y), (tx, ty), _ = random_triplets()
     x, tx = (tx, tx) if shared == "x" else (x, tx)
     y, ty = (ty, ty) if shared == "y" else (y, ty)
     moving = [part.requires_grad_() for part, name in ((x, "x"), (y, "y")) if name != shared]
     weights = torch.rand(2, 5, 7, dtype=FLOAT64, generator=torch.Generator().manual_seed(1))
-    found = all_pairs_divergence((x, y), (tx, ty), temperature=2.0, precision=precision)
-    teacher_pairs = (tx[:, :, None] - ty[:, None]).detach()
-    wanted = reference.divergence(x[:, :, None] - y[:, None], teacher_pairs, 2.0)
+    found = all_pairs_divergence((x, y), (tx, ty), temperature=2.0, form=form)
+    wanted = all_pairs_kl((x, y), (tx.detach(), ty.detach()), 2.0)
     torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-12)
     assert_same_loss((weights * found).sum(), (weights * wanted).sum(), tuple(moving), 1e-9)
 
 
 @pytest.mark.parametrize(
-    ("scale", "precision", "tolerance"),
+    ("scale", "form", "tolerance"),
     # The definition in float32 subtracts logits of a thousand, whose last digit is 6e-5.
     [(0.2, "float32", 1e-5), (3.0, "float32", 2e-5), (25.0, "float64", 1e-5), (300.0, "direct", 2e-3)],
 )
-def test_divergence_of_outliers_is_finite_and_right(scale, precision, tolerance):
+def test_divergence_of_outliers_is_finite_and_right(scale, form, tolerance):
     (x, y), (tx, ty), _ = random_triplets(batch=1, references=30, queries=40, channels=64, dtype=torch.float32)
     common = torch.zeros(64)
     common[::9] = 200.0  # outlier channels that all tokens share cost nothing: centring takes them out
     x, y, tx, ty = (scale * tensor + common for tensor in (x, y, tx, ty))
     spread = float(max(pair_spread(x, y, 1.0), pair_spread(tx, ty, 1.0)))
-    assert choose_precision(spread) == precision
+    assert choose_form(spread) == form
     inputs = (x.requires_grad_(), y.requires_grad_())
-    found = all_pairs_divergence(inputs, (tx, ty), temperature=1.0, precision=None)
+    found = all_pairs_divergence(inputs, (tx, ty), temperature=1.0, form=None)
     wide = tuple(part.detach().double().requires_grad_() for part in inputs)
-    teacher_pairs = tx.double()[:, :, None] - ty.double()[:, None]
-    wanted = reference.divergence(wide[0][:, :, None] - wide[1][:, None], teacher_pairs, 1.0)
+    wanted = all_pairs_kl(wide, (tx.double(), ty.double()), 1.0)
     torch.testing.assert_close(found.double(), wanted, rtol=tolerance, atol=tolerance)
     for mine, plain in zip(gradients(found.mean(), inputs), gradients(wanted.mean(), wide), strict=True):
         assert (mine.double() - plain).norm() <= tolerance * plain.norm()
 
 
-def test_precision_leaves_headroom():
-    assert choose_precision(69.0) == "float32"
-    assert choose_precision(69.0, headroom=1.25) == "float64"
-    assert choose_precision(600.0, headroom=1.25) == "direct"
+def test_the_form_leaves_headroom():
+    assert choose_form(69.0) == "float32"
+    assert choose_form(69.0, headroom=1.25) == "float64"
+    assert choose_form(600.0, headroom=1.25) == "direct"
 
 
-def test_a_precision_too_narrow_for_the_features_is_not_silent():
+def test_a_form_too_narrow_for_the_features_is_not_silent():
     (x, y), teacher, _ = random_triplets(dtype=torch.float32)
-    kl = all_pairs_divergence((300 * x, y), teacher, temperature=1.0, precision="float32")
+    kl = all_pairs_divergence((300 * x, y), teacher, temperature=1.0, form="float32")
     assert not kl.isfinite().all()
 
 
 def test_paired_divergence_equals_its_definition():
     d, target = torch.randn(2, 3, 4, 9, dtype=FLOAT64, generator=torch.Generator().manual_seed(0)).unbind(0)
     d.requires_grad_()
-    found, wanted = paired_divergence(d, target, temperature=0.5), reference.divergence(d, target, 0.5)
+    found = paired_divergence(d, target, temperature=0.5)
+    zero = torch.zeros_like(target)
+    wanted = equations.kl(equations.log_pi(target, zero, 0.5), equations.log_pi(d, zero, 0.5))
     torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)
     assert_same_loss(found.square().sum(), wanted.square().sum(), (d,), 1e-10)
 
@@ -159,8 +170,8 @@ def test_gradients_pass_finite_differences():
     for penalty in ("l1", "huber"):
         settings = {"weights": (1.0, 0.5, 2.0), "penalty": penalty, "huber_delta": 0.05}
         assert torch.autograd.gradcheck(lambda p, q, s=settings: angle_loss((p, q), teacher, k, **s)[0], inputs)
-    for precision in ("float64", "direct"):
-        settings = {"temperature": 2.0, "precision": precision}
+    for form in ("float64", "direct"):
+        settings = {"temperature": 2.0, "form": form}
         assert torch.autograd.gradcheck(lambda p, q, s=settings: all_pairs_divergence((p, q), teacher, **s), inputs)
     assert torch.autograd.gradcheck(lambda p: paired_divergence(p, teacher[0], temperature=2.0), inputs[:1])
     settings = {"weight_huber": 0.7, "weight_cosine": 2.0, "huber_delta": 0.3}
@@ -171,12 +182,13 @@ def test_gradients_pass_finite_differences():
 def test_intra_equals_its_definition_over_strided_views_and_several_parts():
     generator = torch.Generator().manual_seed(0)
     teacher = torch.randn(2, 8, 300, 48, generator=generator, dtype=FLOAT64)
-    config = replace(paper_loss(temperature=1.0), huber_delta=0.5, weight_cosine=2.0)
     student = (teacher[:, ::2] + torch.randn(2, 4, 300, 48, generator=generator, dtype=FLOAT64)).requires_grad_()
     settings = {"weight_huber": 1.0, "weight_cosine": 2.0, "huber_delta": 0.5}
     parts = [(student[:, :, :7], teacher[:, ::2, :7]), (student[:, :, 7:], teacher[:, ::2, 7:])]
     found, parts_huber, parts_cosine = intra_loss(parts, **settings)
-    assert_same_loss(found, reference.intra(student, teacher[:, ::2], config), (student,), 1e-10)
+    once = equations.l_intra(student, teacher[:, ::2], delta=0.5)
+    wanted = once + (1 - equations.cosine(student, teacher[:, ::2])).mean()
+    assert_same_loss(found, wanted, (student,), 1e-10)
     torch.testing.assert_close(found, parts_huber + 2 * parts_cosine)
     assert not parts_huber.requires_grad
 
@@ -205,18 +217,33 @@ CASES = {
 @pytest.mark.parametrize("repeated", [False, True], ids=["distinct", "repeated frames"])
 def test_paper_loss_equals_the_equations(settings, repeated):
     generator = torch.Generator().manual_seed(3)
-    teacher = 5 * torch.randn(2, 8, 12, 16, generator=generator, dtype=FLOAT64)
+    teacher = 5 * torch.randn(2, 8, 15, 16, generator=generator, dtype=FLOAT64)  # camera, 2 registers, 12 patches
     if repeated:
         teacher[:, 3], teacher[:, 6] = teacher[:, 2], teacher[:, 0]
     kept = [0, 2, 4, 6]
-    student = teacher[:, kept] + torch.randn(2, 4, 12, 16, generator=generator, dtype=FLOAT64)
+    student = teacher[:, kept] + torch.randn(2, 4, 15, 16, generator=generator, dtype=FLOAT64)
     student.requires_grad_()
-    config = replace(paper_loss(temperature=2.0), **{"num_reference": 6, "num_query": 9, **settings})
+    config = PAPER.changed(loss={"temperature": 2.0, "num_reference": 6, "num_query": 9, **settings}).loss
     draws = draw_tokens(config, tokens_per_view=12, student_views=4, held_out_views=4, generator=generator)
-    no_special = teacher.new_empty(2, 8, 0, 16)
-    targets = teacher_targets({5: (teacher, no_special)}, kept, draws, config)
-    found, terms = adaptation_loss({5: (student, no_special[:, :4])}, targets, draws, config)
-    wanted = reference.paper_total(student, teacher, kept, draws, config, targets.anchors.angle)
+    levels = [{5: (tokens[:, :, 3:], tokens[:, :, :3])} for tokens in (student, teacher)]
+    found, terms = adaptation_loss(levels[0], targets_of(levels[1], kept, draws, config), draws, config)
+
+    others = [view for view in range(4) if view != config.reference_view]
+    (p, q), (teacher_p, teacher_q) = (
+        (
+            tokens[:, config.reference_view, 3:][:, draws.angle.reference],
+            tokens[:, others, 3:].flatten(1, 2)[:, draws.angle.query.flatten()],
+        )
+        for tokens in (student, teacher[:, kept])
+    )
+    held_out = teacher[:, 1::2, 3:].flatten(1, 2)
+    chosen = equations.nearest_and_farthest(teacher_p, held_out, count=config.num_anchors)
+    anchors = held_out[torch.arange(2)[:, None, None], chosen]
+    camera_and_patches = [0, *range(3, 15)]
+    features = (student[:, :, camera_and_patches], teacher[:, kept][:, :, camera_and_patches])
+    wanted = equations.l_geo(
+        features, (p, q), (teacher_p, teacher_q), anchors, delta=config.huber_delta, temperature=2.0
+    )
     assert_same_loss(found, wanted, (student,), 1e-9)
     assert terms["total"] == found
 
@@ -227,11 +254,11 @@ def test_outlier_channels_at_temperature_one_keep_every_version_finite():
     teacher[..., ::7] += 50 * torch.randn(1, 8, 20, 5, generator=generator).sign()
     special = teacher[:, :, :5].clone()
     student = teacher[:, ::2] + 5 * torch.randn(1, 4, 20, 32, generator=generator)
-    for config in (paper_loss(temperature=1.0), released_vggt_loss()):
+    for config in (replace(PAPER.loss, temperature=1.0), RELEASED_VGGT.loss):
         tokens = 25 if config.cross_tokens == "all" else 20
         draws = draw_tokens(config, tokens_per_view=tokens, student_views=4, held_out_views=4, generator=generator)
         inputs = (student.clone().requires_grad_(), special[:, ::2].clone().requires_grad_())
-        targets = teacher_targets({0: (teacher, special)}, [0, 2, 4, 6], draws, config)
+        targets = targets_of({0: (teacher, special)}, [0, 2, 4, 6], draws, config)
         loss, terms = adaptation_loss({0: inputs}, targets, draws, config)
         loss.backward()
         assert all(term.isfinite() for term in terms.values())

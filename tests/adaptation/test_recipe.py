@@ -1,13 +1,14 @@
 """The named settings are the published ones, and settings that make no sense are refused in one sentence."""
 
 import dataclasses
+from typing import get_args
 
 import pytest
 import torch
 
 from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapt import learning_rate
-from freegeo.adaptation.views import schedule
+from freegeo.adaptation.views import schedule, view_sets
 from freegeo.errors import UserError
 from freegeo.models.api import AdaptationDefaults, ModelSpec
 from freegeo.models.catalog import build_empty
@@ -20,7 +21,7 @@ GIANT = ModelSpec(
     adaptation=AdaptationDefaults(temperature=10.0, scene_lr=3e-5, published="da3"),
 )  # fmt: skip
 
-# Sets per scene, distinct seeds, epochs, lr, final lr: fact sheet, sections 2 and 3.4.
+# Sets per scene, distinct seeds, epochs, lr, final lr: the paper's supplement; docs/method.md, "Released recipes".
 PUBLISHED = {
     ("paper", "eth3d"): (10, 10, 3, 1e-4, 1e-7),
     ("paper", "7scenes"): (20, 20, 3, 5e-5, 1e-8),
@@ -35,7 +36,7 @@ PUBLISHED = {
     ("released-vggt", "scannetpp"): (10, 10, 3, 3e-5, 1e-8),
     ("released-vggt", "hiroom"): (5, 5, 3, 1e-4, 1e-8),
 }
-# Optimiser steps of the released runs on the benchmark's scene counts: fact sheet, section 3.4.
+# Optimiser steps of the released runs on the benchmark's scene counts: docs/method.md, "Released recipes".
 STEPS = {
     ("released-da3", "eth3d", 11): 39,
     ("released-da3", "7scenes", 7): 51,
@@ -59,6 +60,22 @@ def test_dataset_settings_are_the_published_ones(name, dataset):
 def test_released_runs_have_the_published_number_of_steps(name, dataset, scenes):
     found = recipes.named(name, GIANT, dataset)
     assert len(schedule([20] * scenes, found, seed=42)) == STEPS[name, dataset, scenes]
+
+
+def test_the_papers_settings_are_those_of_a_published_model():
+    assert recipes.paper(GIANT, "eth3d") == recipes.PAPER
+    loss = recipes.PAPER.loss
+    assert (loss.num_reference, loss.num_query, loss.num_anchors) == (256, 256, 4)
+    assert (recipes.PAPER.views, recipes.PAPER.rank, recipes.PAPER.alpha) == (8, 32, 32)
+
+
+@pytest.mark.parametrize("views", range(3, 11))
+def test_every_recipe_keeps_every_second_view(views):
+    """Eight views keep (0, 2, 4, 6), as in the paper; scenes of fewer views and `--views` keep to the same rule."""
+    for name in get_args(recipes.RecipeName):
+        recipe = recipes.named(name, GIANT, "eth3d").changed(views=max(views, 8), repeat_views=False)
+        first = view_sets([views], recipe)[0]
+        assert (first.frames, first.kept) == (tuple(range(views)), tuple(range(0, views, 2)))
 
 
 def test_recipes_differ_where_the_paper_and_the_release_do():
@@ -121,6 +138,14 @@ def test_changed_replaces_what_is_given_and_leaves_the_rest():
     assert dataclasses.replace(scene.changed(lr=1.0), lr=scene.lr) == scene
 
 
+def test_changed_reaches_the_loss_and_leaves_its_other_settings():
+    scene = recipes.scene(SPEC)
+    found = scene.changed(loss={"weight_kq": 0.0, "selection": "topk"}, lr=None)
+    assert (found.loss.weight_kq, found.loss.selection) == (0.0, "topk")
+    assert found.changed(loss={"weight_kq": scene.loss.weight_kq, "selection": scene.loss.selection}) == scene
+    assert scene.changed(loss=None) == scene.changed(loss={}) == scene
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -135,6 +160,8 @@ def test_changed_replaces_what_is_given_and_leaves_the_rest():
         ({"batch": 0}, "batch must be positive"),
         ({"steps": 0}, "at least 1"),
         ({"steps": 5, "epochs": 2}, "either --steps or --epochs"),
+        ({"loss": {"weight_kk": 0.0}}, "no loss setting 'weight_kk'; known are intra_tokens"),
+        ({"loss": {"selection": "best"}}, "selection is one of mixed, topk, random"),
     ],
 )
 def test_impossible_settings_are_refused(changes, words):
@@ -143,7 +170,7 @@ def test_impossible_settings_are_refused(changes, words):
 
 
 def test_unknown_recipes_and_missing_datasets_are_refused():
-    with pytest.raises(UserError, match=r"unknown recipe 'best'.*scene, paper"):
+    with pytest.raises(UserError, match="Known are scene, paper, released-da3 and released-vggt"):
         recipes.named("best", SPEC)
     for name in ("paper", "released-da3", "released-vggt"):
         with pytest.raises(UserError, match="choose --dataset from eth3d, 7scenes, scannetpp, hiroom"):

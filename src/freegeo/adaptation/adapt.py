@@ -211,7 +211,7 @@ def _learn(
     targets, draws = targets_of(sample, visit, recipe.loss, seed=run.seed)
     with run.compute.autocast():
         student = loss_features(adapter.model, sample.student()[0])
-    loss, terms = adaptation_loss(student.levels, targets, draws, recipe.loss, precision=sample.form)
+    loss, terms = adaptation_loss(student.levels, targets, draws, recipe.loss, form=sample.form)
     scaler.scale(loss * share).backward()
     if recipe.hold:
         # Not in the paper: with all views the adapted features shall stay where the frozen ones are.

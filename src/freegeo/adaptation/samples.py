@@ -22,18 +22,17 @@ from torch.nn import functional as F
 
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.losses import (
-    LossConfig,
-    Precision,
+    KLForm,
+    Level,
     StepDraws,
     TeacherTargets,
-    choose_precision,
+    choose_form,
     draw_tokens,
     held_out_tokens,
     teacher_spread,
     teacher_targets,
 )
-from freegeo.adaptation.losses.targets import Level
-from freegeo.adaptation.recipe import Recipe
+from freegeo.adaptation.recipe import LossConfig, Recipe
 from freegeo.adaptation.views import ViewSet, Visit
 from freegeo.errors import UserError
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
@@ -119,7 +118,7 @@ class Sample:
     """(1, L, C): the teacher's tokens of the held-out views at the last loss layer, one view after another."""
     kept: tuple[int, ...]
     """Positions of the student's views among `tokens`."""
-    form: Precision | None = None
+    form: KLForm | None = None
     """How the all-pairs KL is computed; None: the loss measures it, which makes an accelerator wait."""
 
     def student(self) -> tuple[ViewTokens, Mapping[int, Level]]:
@@ -221,7 +220,7 @@ class Samples:
             return sample
         # Read once per view set instead of in every step, where an accelerator would have to wait for it.
         spread = teacher_spread(*targets_of(sample, visit, config, seed=self._seed), config)
-        return replace(sample, form=choose_precision(float(spread), headroom=SPREAD_HEADROOM))
+        return replace(sample, form=choose_form(float(spread), headroom=SPREAD_HEADROOM))
 
     def _in_file(self, sample: Sample) -> Sample:
         """Move a sample to a file; its tensors are read from there, by the system, when they are used."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapt import Progress
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.recipe import Recipe
+from freegeo.adaptation.recipe import PAPER_SEED, Recipe
 from freegeo.benchmark.adapters import AdapterJob, peak_memory_gb, reset_peak_memory, train, use
 from freegeo.benchmark.frames import require_truth
 from freegeo.benchmark.paper.variants import Variant, variant
@@ -64,7 +64,7 @@ class Setup:
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the recipe that are replaced, as in `Recipe.changed`."""
     adapt_per: AdaptPer = "dataset"
-    adapt_seed: int = 42
+    adapt_seed: int = PAPER_SEED
     epoch: int | None = None
     """Which epoch's adapter predicts; None: the last."""
     given_cameras: bool = False

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
+from freegeo.adaptation.recipe import PAPER_SEED, RecipeName
 from freegeo.cli import console
 from freegeo.errors import FreeGeoError, UserError
 
@@ -66,7 +67,7 @@ class BenchModel:
     """cpu, cuda, cuda:N or mps; default: the best at hand."""
     precision: Literal["fp32", "bf16", "fp16"] | None = None
     """Arithmetic of the transformer; default: bf16 on CUDA, else fp32."""
-    recipe: Literal["paper", "scene", "released-da3", "released-vggt"] = "paper"
+    recipe: RecipeName = "paper"
     """Named settings of adaptation."""
     steps: int | None = None
     """Optimiser steps instead of the recipe's length."""
@@ -78,7 +79,7 @@ class BenchModel:
     """Weight of keeping what the model says with all views as it is; default: 0, as in the paper."""
     adapt_per: Literal["dataset", "scene"] = "dataset"
     """One adapter for all scenes of a dataset, or one for each."""
-    adapt_seed: int = 42
+    adapt_seed: int = PAPER_SEED
     """Seed of the adaptation."""
     epoch: int | None = None
     """Epoch whose adapter is used, counted from 0; default: the last."""

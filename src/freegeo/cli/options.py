@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from freegeo.adaptation.recipe import PAPER, SEED, DatasetName, Recipe, RecipeName, named
+from freegeo.errors import UserError
 from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL
 
 SMALL_MODEL = 20_000_000
 """Parameters below which a model runs on one CPU thread."""
 
 if TYPE_CHECKING:
-    from freegeo.adaptation.recipe import Recipe
     from freegeo.models.api import ModelSpec, ReconstructionModel
     from freegeo.models.precision import Compute
 
@@ -32,7 +35,7 @@ class ModelOptions:
     """cpu, cuda, cuda:N or mps; default: the best at hand."""
     precision: Literal["fp32", "bf16", "fp16"] | None = None
     """Arithmetic of the transformer; default: bf16 on CUDA, else fp32."""
-    seed: int = 43
+    seed: int = SEED
     """Seed of everything random."""
     reference: str | None = None
     """Reference view of the frozen model: first, middle, saddle_balanced, saddle_sim_range; default: the model's."""
@@ -85,9 +88,9 @@ def use_few_threads(model: ReconstructionModel) -> None:
 class RecipeOptions:
     """How the model is adapted; options left out come from the recipe."""
 
-    recipe: Literal["scene", "paper", "released-da3", "released-vggt"] = "scene"
+    recipe: RecipeName = "scene"
     """Named settings; the last three also need --dataset."""
-    dataset: Literal["eth3d", "7scenes", "scannetpp", "hiroom", "procedural"] | None = None
+    dataset: DatasetName | None = None
     """Whose published settings a dataset recipe takes."""
     views: int | None = None
     """Views the teacher sees (8)."""
@@ -105,28 +108,51 @@ class RecipeOptions:
     """Rank of the adapter."""
     hold: float | None = None
     """Weight of keeping what the model says with all views as it is (0: the paper; 1 where more views get worse)."""
+    loss: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
+    """Settings of the loss, such as weight_kq=0 or selection=topk,angle_weights=2,2,2; may be given several times."""
 
     def build(self, spec: ModelSpec) -> Recipe:
         """Return the recipe for a model."""
-        from freegeo.adaptation import recipe as recipes
-
-        named = recipes.named(self.recipe, spec, self.dataset)
-        return named.changed(
+        return named(self.recipe, spec, self.dataset).changed(
             views=self.views, keep=parse_keep(self.keep), steps=self.steps, epochs=self.epochs,
-            sets_per_scene=self.sets, lr=self.lr, rank=self.rank, hold=self.hold,
+            sets_per_scene=self.sets, lr=self.lr, rank=self.rank, hold=self.hold, loss=parse_loss(self.loss),
         )  # fmt: skip
 
 
 def parse_keep(text: str | None) -> tuple[int, ...] | None:
     """Read positions such as 0,2,4,6."""
-    from freegeo.errors import UserError
-
     if text is None:
         return None
     try:
         return tuple(int(part) for part in text.split(","))
     except ValueError:
         raise UserError(f"--keep '{text}' is no list of positions. Write it as 0,2,4,6.") from None
+
+
+def parse_loss(texts: Sequence[str]) -> dict[str, Any]:
+    """Read settings of the loss such as weight_kq=0,selection=topk; each value is read as what the paper's is."""
+    # A comma separates settings only before another `name=`, since a setting may be a list of numbers.
+    return dict(_loss_setting(part) for text in texts for part in re.split(r",(?=\s*\w+\s*=)", text))
+
+
+def _loss_setting(text: str) -> tuple[str, Any]:
+    name, equals, value = (part.strip() for part in text.partition("="))
+    if not equals:
+        raise UserError(f"--loss '{text}' is no setting. Write it as weight_kq=0.")
+    # A name that is none stays text; `LossConfig.changed` lists those that are.
+    example = vars(PAPER.loss).get(name, "")
+    try:
+        return name, _read_like(example, value)
+    except ValueError:
+        raise UserError(f"--loss {name}: '{value}' is no value like {example}.") from None
+
+
+def _read_like(example: object, text: str) -> object:
+    if isinstance(example, bool):
+        return ("false", "true").index(text.lower()) == 1
+    if isinstance(example, tuple):
+        return tuple(float(part) for part in text.split(","))
+    return type(example)(text)
 
 
 @Parameter(name="*")

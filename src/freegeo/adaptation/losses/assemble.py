@@ -1,4 +1,8 @@
-"""The adaptation loss: intra + angles + distances, on the features of teacher and student."""
+"""The adaptation loss: intra + angles + distances, on the features of teacher and student.
+
+`equations` says the same in the paper's words. A new term is computed here, from the tokens p, q and k, and has its
+weight in `LossConfig`.
+"""
 
 from collections.abc import Mapping
 
@@ -6,18 +10,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from freegeo.adaptation.losses.config import LossConfig
-from freegeo.adaptation.losses.divergence import (
-    Precision,
-    all_pairs_divergence,
-    pair_spread,
-    paired_divergence,
-)
+from freegeo.adaptation.losses.angles import angle_loss
+from freegeo.adaptation.losses.divergence import KLForm, all_pairs_divergence, pair_spread, paired_divergence
 from freegeo.adaptation.losses.intra import intra_loss
 from freegeo.adaptation.losses.numerics import widened
-from freegeo.adaptation.losses.relational import angle_loss
 from freegeo.adaptation.losses.sampling import StepDraws, TokenDraw
 from freegeo.adaptation.losses.targets import Level, TeacherTargets, cross_tokens, intra_special
+from freegeo.adaptation.recipe import LossConfig
 from freegeo.errors import FreeGeoError
 
 
@@ -27,19 +26,19 @@ def adaptation_loss(
     draws: StepDraws,
     config: LossConfig,
     *,
-    precision: Precision | None = None,
+    form: KLForm | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The total loss of one step (scalar, float32 or wider) and its detached terms.
 
     student_levels: per loss layer the patches (B, M, P, C) and special tokens (B, M, T, C) of the kept views; the intra
     loss is the mean over layers, the relational loss reads the highest layer number. draws: those that `teacher` was
-    made with, on any device; on the features' device nothing has to be moved. precision: see `all_pairs_divergence`;
-    only `pairing` "all" reads it, and None costs one host read per distance term there.
+    made with, on any device; on the features' device nothing has to be moved. form: see `all_pairs_divergence`; only
+    `pairing` "all" reads it, and None costs one host read per distance term there.
 
     Terms: `total`; `intra` (weighted) and its unweighted parts `huber` and `cos` (mean of 1 - cosine); `cross`
     (weighted); unweighted `phi1`, `phi2`, `phi3` (angles at reference, anchor, query) and `phi` (weighted sum);
     unweighted `kl_pk`, `kl_pq`, `kl_kq`. Terms of weight 0 are absent. Raises `FreeGeoError` where the teacher's
-    layers are not the student's. Source: specs sections 2 and 3.1.
+    layers are not the student's. Source: docs/method.md, "Equations of the paper" and "Paper and released code".
     """
     if student_levels.keys() != teacher.kept.keys():
         raise FreeGeoError(
@@ -65,7 +64,7 @@ def adaptation_loss(
             )
             cross.append(phi)
             terms |= {"phi1": parts[0], "phi2": parts[1], "phi3": parts[2], "phi": phi}
-        distances = _distances(student_draws[1], teacher_draws[1], teacher.anchors.distance, config, precision)
+        distances = _distances(student_draws[1], teacher_draws[1], teacher.anchors.distance, config, form)
         for name, (weight, value) in distances.items():
             cross.append(weight * value)
             terms[name] = value
@@ -76,13 +75,13 @@ def adaptation_loss(
 
 
 def feature_distance(
-    levels: Mapping[int, Level], wanted: Mapping[int, Level], config: LossConfig
+    student_levels: Mapping[int, Level], teacher_levels: Mapping[int, Level], config: LossConfig
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The intra loss of features against others of the same views, mean over layers, and its parts (see above)."""
+    """The intra loss of features against the teacher's of the same views, mean over layers, and its parts as above."""
     per_layer = []
-    for layer, (patch, special) in levels.items():
-        wanted_patch, wanted_special = wanted[layer]
-        pairs = [(patch, wanted_patch), (intra_special(config, special), intra_special(config, wanted_special))]
+    for layer, (patch, special) in student_levels.items():
+        teacher_patch, teacher_special = teacher_levels[layer]
+        pairs = [(patch, teacher_patch), (intra_special(config, special), intra_special(config, teacher_special))]
         per_layer.append(
             intra_loss(
                 pairs,
@@ -110,10 +109,10 @@ def _gather_draws(tokens: Tensor, draws: StepDraws, config: LossConfig) -> tuple
     gathered = widened(tokens.reshape(batch, views * per_view, channels).index_select(1, positions))
     sizes = [size for draw in chosen for size in (draw.reference.numel(), draw.query.numel())]
     parts = gathered.split(sizes, dim=1)
-    found = [
+    per_draw = [
         (parts[2 * number], parts[2 * number + 1].unflatten(1, draw.query.shape)) for number, draw in enumerate(chosen)
     ]
-    return found[0], found[-1]
+    return per_draw[0], per_draw[-1]
 
 
 def _flat_positions(draw: TokenDraw, per_view: int, config: LossConfig, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -129,7 +128,7 @@ def _pooled(tokens: Tokens) -> Tokens:
 
 
 def _distances(
-    student: Tokens, teacher: Tokens, anchors: Tensor, config: LossConfig, precision: Precision | None
+    student: Tokens, teacher: Tokens, anchors: Tensor, config: LossConfig, form: KLForm | None
 ) -> dict[str, tuple[float, Tensor]]:
     """Weight and value of the distance terms that have a weight."""
     weights = {"kl_pk": config.weight_pk, "kl_pq": config.weight_pq, "kl_kq": config.weight_kq}
@@ -143,7 +142,7 @@ def _distances(
         elif config.pairing == "paired":
             value = _paired(name, student, teacher, anchors, config)
         else:
-            value = _all_pairs(name, student, teacher, anchors, config, precision)
+            value = _all_pairs(name, student, teacher, anchors, config, form)
         values[name] = (weight, value)
     return values
 
@@ -155,24 +154,24 @@ def _pairs(tokens: Tokens) -> int:
 
 def _reference_anchor(student: Tokens, teacher: Tokens, anchors: Tensor, config: LossConfig) -> Tensor:
     used = _pairs(student) if config.pairing == "paired" else None
-    found, wanted = (p[:, :used, None] - anchors[:, :used] for p, _ in (student, teacher))
-    return _of_differences(found, wanted, config)
+    differences = [p[:, :used, None] - anchors[:, :used] for p, _ in (student, teacher)]
+    return _of_differences(*differences, config)
 
 
 def _paired(name: str, student: Tokens, teacher: Tokens, anchors: Tensor, config: LossConfig) -> Tensor:
     """The i-th reference (or its anchors) with the i-th query of every row."""
     pairs = _pairs(student)
     if name == "kl_pq":
-        found, wanted = (p[:, None, :pairs] - q[:, :, :pairs] for p, q in (student, teacher))
+        differences = [p[:, None, :pairs] - q[:, :, :pairs] for p, q in (student, teacher)]
     else:
         sign = 1 if config.kq_order == "kq" else -1
         k = anchors[:, None, :pairs]
-        found, wanted = (sign * (k - q[:, :, :pairs, None]) for _, q in (student, teacher))
-    return _of_differences(found, wanted, config)
+        differences = [sign * (k - q[:, :, :pairs, None]) for _, q in (student, teacher)]
+    return _of_differences(*differences, config)
 
 
 def _all_pairs(
-    name: str, student: Tokens, teacher: Tokens, anchors: Tensor, config: LossConfig, precision: Precision | None
+    name: str, student: Tokens, teacher: Tokens, anchors: Tensor, config: LossConfig, form: KLForm | None
 ) -> Tensor:
     """Every reference (or every anchor of every reference) with every query."""
     student, teacher = _pooled(student), _pooled(teacher)
@@ -181,14 +180,14 @@ def _all_pairs(
         student, teacher = (k, student[1]), (k, teacher[1])
         if config.kq_order == "qk":
             student, teacher = student[::-1], teacher[::-1]
-    kl = all_pairs_divergence(student, teacher, temperature=config.temperature, precision=precision)
+    kl = all_pairs_divergence(student, teacher, temperature=config.temperature, form=form)
     return _outer(kl, config).mean()
 
 
-def _of_differences(found: Tensor, wanted: Tensor, config: LossConfig) -> Tensor:
+def _of_differences(student: Tensor, teacher: Tensor, config: LossConfig) -> Tensor:
     if config.distance_mode == "huber":
-        return F.smooth_l1_loss(found, wanted, beta=config.distance_beta)
-    return _outer(paired_divergence(found, wanted, temperature=config.temperature), config).mean()
+        return F.smooth_l1_loss(student, teacher, beta=config.distance_beta)
+    return _outer(paired_divergence(student, teacher, temperature=config.temperature), config).mean()
 
 
 def _outer(kl: Tensor, config: LossConfig) -> Tensor:
@@ -200,7 +199,7 @@ def _outer(kl: Tensor, config: LossConfig) -> Tensor:
 def teacher_spread(teacher: TeacherTargets, draws: StepDraws, config: LossConfig) -> Tensor:
     """The largest spread of the teacher's softmax inputs over the pairs of `pairing` "all", a scalar tensor.
 
-    Read once per view set, `choose_precision(spread, headroom=...)` spares the step its host reads.
+    Read once per view set, `choose_form(spread, headroom=...)` spares the step its host reads.
     """
     tokens = cross_tokens(config, teacher.kept[max(teacher.kept)])
     p, q = _pooled(_gather_draws(tokens, draws, config)[1])

@@ -1,7 +1,22 @@
 """The distance terms: KL between teacher and student distributions `softmax((a - b)/tau)` over channels.
 
-All pairs of two token sets are evaluated through matrix products of per-token exponentials (specs section 7.2), whose
-range decides the precision (section 7.3); chosen pairs are evaluated from the definition.
+All pairs (x, y) of two token sets, here already divided by tau, would take R * m softmaxes over C channels. Since
+exp(x - y) = exp(x) exp(-y), matrix products of the tokens' exponentials E = exp(x) and F = exp(-y) do the same work.
+A prime marks the teacher's tokens, * multiplies element by element, and g is the weight of each pair in the loss:
+
+    Z      = E F^T                                                    the partition functions of all pairs, (R, m)
+    pi_c   = E_c F_c / Z,   log pi_c = x_c - y_c - log Z              one pair, channel c
+    KL     = sum over c of pi'_c (log pi'_c - log pi_c)
+           = [ (E' * (x' - x)) F'^T + E' (F' * (y - y'))^T ] / Z' - log Z' + log Z
+    dKL/dx = sum over y of g (pi - pi') = E * ((g / Z) F) - E' * ((g / Z') F'),   and dKL/dy likewise
+
+In place of E the code holds E / max E, likewise F, and adds the logarithms of the maxima to log Z: nothing overflows.
+What can go wrong is underflow: Z is lost where no channel is large in both factors. With centred tokens (`_centred`)
+it is at least C exp(-S) for the spread S that `pair_spread` measures, so S decides between float32, float64 and the
+definition. Half precision is never used: KL is a small difference of large logarithms.
+Source: docs/method.md, "Divergence by matrix products" and "Range and precision".
+
+Chosen pairs (`pairing` "paired") are too few for that and are evaluated from the definition, as `equations` has it.
 """
 
 from typing import Literal
@@ -13,14 +28,16 @@ from torch.autograd.function import once_differentiable
 
 from freegeo.adaptation.losses.numerics import block_elements, blocks, exact_matmul, widened
 
-Precision = Literal["float32", "float64", "direct"]
+KLForm = Literal["float32", "float64", "direct"]
 """How all-pairs KL is evaluated: matrix products in float32 or in float64, or the definition pair by pair."""
 
+# Z >= C exp(-spread). float32 holds exp(-87) in full precision and float64 exp(-708): the largest terms of every Z stay
+# clear of that, and what underflows beside them is less than e^-17 of Z.
 FLOAT32_SPREAD, FLOAT64_SPREAD = 70.0, 650.0
 
 
-def choose_precision(spread: float, *, headroom: float = 1.0) -> Precision:
-    """The cheapest safe evaluation for softmax inputs of this `spread` (see `pair_spread`); specs section 7.3.
+def choose_form(spread: float, *, headroom: float = 1.0) -> KLForm:
+    """The cheapest safe evaluation for softmax inputs of this `spread` (see `pair_spread`).
 
     headroom: factor by which the spread may grow before the choice is unsafe; above 1 where the teacher's spread is
     measured once and stands for a student that drifts from it.
@@ -31,10 +48,11 @@ def choose_precision(spread: float, *, headroom: float = 1.0) -> Precision:
 
 
 def _centred(x: Tensor, y: Tensor, common: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
-    """x/tau and y/tau less a common vector and less each token's channel mean: no softmax of a difference changes.
+    """x/tau and y/tau less a common vector and less each token's channel mean.
 
-    The common vector takes out the outlier channels that all tokens of a ViT share, which is what keeps the
-    exponentials in range.
+    Neither changes a softmax of x - y: the common vector cancels in the difference, and a softmax ignores a constant
+    over channels. The common vector takes out the outlier channels that all tokens of a ViT share, which is what keeps
+    the exponentials in range.
     """
     x, y = (x - common).div_(temperature), (y - common).div_(temperature)
     return x.sub_(x.mean(-1, keepdim=True)), y.sub_(y.mean(-1, keepdim=True))
@@ -46,7 +64,11 @@ def _mean_token(x: Tensor, y: Tensor) -> Tensor:
 
 @torch.no_grad()
 def pair_spread(x: Tensor, y: Tensor, temperature: float) -> Tensor:
-    """S of the pairs x (B, R, C), y (B, m, C), a scalar tensor: partition functions are at least C exp(-S)."""
+    """The spread S of the pairs x (B, R, C), y (B, m, C), a scalar tensor: the largest x plus the largest -y.
+
+    Centred tokens have a mean of 0 over channels, so exp(x - y) has one of at least 1 and its sum is at least C; with
+    the largest values divided out of both factors, Z is at least C exp(-S).
+    """
     x, y = widened(x), widened(y)
     x, y = _centred(x, y, _mean_token(x, y), temperature)
     return (x.amax((1, 2)) - y.amin((1, 2))).amax()
@@ -64,7 +86,7 @@ class _ProductPairs(torch.autograd.Function):
         teacher_f = (-teacher_y - teacher_y_top).exp_()
         with exact_matmul(x):
             z, teacher_z = e @ f.mT, teacher_e @ teacher_f.mT
-            # Mean over the teacher's distribution of (x' - y') - (x - y).
+            # Mean over the teacher's distribution of (x' - y') - (x - y), times Z'. Without x' = x: one product less.
             cross = teacher_e @ (teacher_f * (y - teacher_y)).mT
             if not same_x:
                 cross.baddbmm_(teacher_e * (teacher_x - x), teacher_f.mT)
@@ -126,47 +148,45 @@ def all_pairs_divergence(
     teacher: tuple[Tensor, Tensor],
     *,
     temperature: float,
-    precision: Precision | None,
+    form: KLForm | None,
 ) -> Tensor:
     """KL(softmax((x' - y')/tau) || softmax((x - y)/tau)) for every pair, (B, R, m), in float32 or wider.
 
     student: (x (B, R, C), y (B, m, C)); teacher: (x', y') of the same shapes. Passing one tensor object as x and x'
-    (or as y and y') saves its products; the gradient goes to the student's tensors. precision None measures
-    the spread of the softmax inputs, which reads one number back to the host; a given `float32` or `float64` is
-    not checked and yields non-finite values where the spread is too large for it. Source: specs sections 7.2, 7.3.
+    (or as y and y') saves its products; the gradient goes to the student's tensors. form None measures the
+    spread of the softmax inputs, which reads one number back to the host; a given `float32` or `float64` is not
+    checked and yields non-finite values where the spread is too large for it.
     """
     same_x, same_y = student[0] is teacher[0], student[1] is teacher[1]
     if same_y and not same_x:
-        return _transposed(student, teacher, temperature=temperature, precision=precision)
+        return _transposed(student, teacher, temperature=temperature, form=form)
     x, y = map(widened, student)
     teacher_x, teacher_y = (widened(tensor).detach() for tensor in teacher)
     wide = x.dtype
     with torch.no_grad():
-        if precision is None:
+        if form is None:
             spreads = [pair_spread(x, y, temperature), pair_spread(teacher_x, teacher_y, temperature)]
-            precision = choose_precision(float(torch.stack(spreads).amax()))
+            form = choose_form(float(torch.stack(spreads).amax()))
         teacher_common = _mean_token(teacher_x, teacher_y)
         # One vector for both branches where they share x, so that its exponentials are shared too.
         common = teacher_common if same_x else _mean_token(x, y)
-    if precision == "float64":
+    if form == "float64":
         x, y, teacher_x, teacher_y, common, teacher_common = (
             tensor.double() for tensor in (x, y, teacher_x, teacher_y, common, teacher_common)
         )
     x, y = _centred(x, y, common, temperature)
     teacher_x, teacher_y = _centred(teacher_x, teacher_y, teacher_common, temperature)
-    if precision == "direct":
+    if form == "direct":
         return _DirectPairs.apply(x, y, teacher_x, teacher_y)
     return _ProductPairs.apply(x, y, teacher_x, teacher_y, same_x).to(wide)
 
 
 def _transposed(
-    student: tuple[Tensor, Tensor], teacher: tuple[Tensor, Tensor], *, temperature: float, precision: Precision | None
+    student: tuple[Tensor, Tensor], teacher: tuple[Tensor, Tensor], *, temperature: float, form: KLForm | None
 ) -> Tensor:
     """Pairs that share y instead of x: x - y = (-y) - (-x)."""
     shared = -teacher[1]
-    flipped = all_pairs_divergence(
-        (shared, -student[0]), (shared, -teacher[0]), temperature=temperature, precision=precision
-    )
+    flipped = all_pairs_divergence((shared, -student[0]), (shared, -teacher[0]), temperature=temperature, form=form)
     return flipped.mT
 
 
@@ -179,11 +199,11 @@ class _PairedKL(torch.autograd.Function):
         kl = torch.empty(rows, dtype=widened(student[:0]).dtype, device=student.device)
         gradient = torch.empty_like(student, dtype=kl.dtype) if ctx.needs_input_grad[0] else None
         for part in blocks(rows, block_elements(student) // channels):
-            log_found, found = _log_and_softmax(student[part], temperature)
-            log_wanted, wanted = _log_and_softmax(teacher[part], temperature)
-            kl[part] = log_wanted.sub_(log_found).mul_(wanted).sum(-1)
+            log_pi, pi = _log_and_softmax(student[part], temperature)
+            log_teacher_pi, teacher_pi = _log_and_softmax(teacher[part], temperature)
+            kl[part] = log_teacher_pi.sub_(log_pi).mul_(teacher_pi).sum(-1)
             if gradient is not None:
-                torch.sub(found, wanted, out=gradient[part]).div_(temperature)
+                torch.sub(pi, teacher_pi, out=gradient[part]).div_(temperature)
         ctx.save_for_backward(gradient)
         ctx.student_dtype = student.dtype
         return kl

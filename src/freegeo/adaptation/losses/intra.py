@@ -1,7 +1,14 @@
 """The intra loss: every token of a kept view should equal the teacher's, `Huber(f' - f) + 1 - cos(f', f)`.
 
-Value and gradient come from one sweep over blocks of tokens that stay in cache; only the gradient is kept for the
-backward pass (specs section 8).
+Per token everything follows from d = f - f', f . f', |f|^2 and |f'|^2, so loss and gradient come from one sweep over
+blocks of tokens that stay in cache: with c = clamp(d, -delta, delta)
+
+    Huber(d) = c (d - c/2)                   its derivative by f   c
+    cos      = f . f' / (|f| |f'|)                                 f' / (|f| |f'|) - cos f / |f|^2
+
+Only the gradient is kept for the backward pass, which scales it. The same by plain operations takes about 20 passes
+over the features, hundreds of MB at full size, and keeps normalised copies of both branches.
+Source: docs/method.md, "Intra loss in one sweep".
 """
 
 from collections.abc import Iterable
@@ -66,7 +73,6 @@ def _block(
     per_channel, weight_cosine, delta = weights
     difference = student - teacher
     clamped = difference.clamp(-delta, delta)
-    # With c = clamp(d, -delta, delta), Huber is c (d - c/2) and its derivative is c.
     huber = difference.sub_(clamped, alpha=0.5).mul_(clamped).sum()
     inverse_student = _reciprocal_norm(student)
     toward_teacher = inverse_student * _reciprocal_norm(teacher)
@@ -86,7 +92,7 @@ def intra_loss(
     pairs: (student, teacher) features of the same tokens, each (B, S, T, C); several pairs (patches and special tokens)
     are averaged as one set of tokens. The Huber penalty is x^2/2 up to `huber_delta`, then
     delta (|x| - delta/2), averaged over channels. Only the first result carries a gradient, and only to the student.
-    Source: the paper's intra loss; specs sections 2 and 8.
+    Source: the paper's L_intra, see `equations`.
     """
     pairs = list(pairs)
     tokens = sum(student[..., 0].numel() for student, _ in pairs)

@@ -1,4 +1,9 @@
-"""How the losses compute: in float32 or wider, with exact matrix products, over blocks that fit in cache."""
+"""How the losses compute: in float32 or wider, with exact matrix products, over blocks that fit in cache.
+
+Features may arrive in half precision under autocast. Losses are differences of nearly equal numbers, whose digits half
+precision and TF32 do not have, so every loss widens its inputs and switches both off for its products. They are a
+small share of a step.
+"""
 
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
@@ -33,8 +38,8 @@ def widened(tensor: Tensor) -> Tensor:
 def exact_matmul(tensor: Tensor) -> Generator[None]:
     """Matrix products on the device of `tensor` in the full precision of their inputs: no autocast, no TF32.
 
-    A KL value is a small difference of large logarithms, and the zero-length rule of the angles assumes the rounding
-    of float32 (specs section 7.1 and 7.3). The setting found is put back on the way out.
+    A KL value is a small difference of large logarithms, and the rule for sides of length zero (`angles`) assumes the
+    rounding of the inputs' type. TF32 is a global setting; the one found is put back on the way out.
     """
     with torch.autocast(device_type=tensor.device.type, enabled=False):
         if tensor.device.type != "cuda":

@@ -1,7 +1,7 @@
 """Which tokens form the triplets: random references and queries, anchors by similarity to the reference.
 
 Draws are separate from the loss: they can be made in advance from the seed of a run, kept beside a teacher cache, or be
-replaced by recorded indices. One draw is shared by the samples of a batch.
+replaced by recorded indices. One draw is shared by the samples of a batch (docs/method.md, "Token draws").
 """
 
 from dataclasses import dataclass, replace
@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from freegeo.adaptation.losses.config import LossConfig, Selection
 from freegeo.adaptation.losses.numerics import blocks, exact_matmul, widened
+from freegeo.adaptation.recipe import LossConfig, Selection
 from freegeo.errors import UserError
 
 SIMILARITY_ELEMENTS = 1 << 24  # one block of the similarity matrix: 64 MB in float32
@@ -98,7 +98,8 @@ def search_anchors(reference: Tensor, held_out: Tensor, *, num_anchors: int, sel
     """Positions (B, R, K) of the anchors among the held-out tokens, by cosine similarity of teacher features.
 
     reference: (B, R, C); held_out: (B, L, C), the held-out views one after another. `topk`: the K most similar,
-    best first; `mixed`: the K//2 most similar, best first, then the K - K//2 least similar, worst first.
+    best first; `mixed`: the K//2 most similar, best first, then the K - K//2 least similar, worst first
+    (docs/method.md, "Anchors").
     Raises `UserError` where there are fewer than K tokens, or for `random`, whose anchors belong to the draw.
     """
     if selection == "random":

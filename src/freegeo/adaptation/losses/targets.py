@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from freegeo.adaptation.losses.config import LossConfig
 from freegeo.adaptation.losses.sampling import StepDraws, TokenDraw, search_anchors
+from freegeo.adaptation.recipe import LossConfig
 from freegeo.errors import UserError
 
 Level = tuple[Tensor, Tensor]

@@ -1,8 +1,24 @@
 """The angle terms: triangles of reference p, query q and anchor k keep the teacher's interior angles.
 
-All R * K * m triplets are evaluated through two matrix products per branch: with u = k - p, the products u . q and
-p . q give every squared side (specs section 7.1, "edge form"). Loss and gradient come from one sweep over blocks of
-references that stay in cache; two arrays of R * K * m live during the sweep and none after it.
+All R * K * m triplets are evaluated through two matrix products per branch, p . q and u . q with the edges u = k - p,
+since the squared sides of a triangle give its angles:
+
+    a = |q - p|^2 = |p|^2 + |q|^2 - 2 p . q        b = |k - p|^2 = |u|^2
+    n = (q - p) . (k - p) = u . q - u . p          c = |q - k|^2 = a + b - 2 n
+    cosines   n / sqrt(a b)  at p        (b - n) / sqrt(b c)  at k        (a - n) / sqrt(a c)  at q
+
+Why edges, and not k . q for c: an anchor is often close to its reference, and a short side that is the difference of
+large squared norms has lost its digits. The edge u is subtracted first, so a short one keeps its digits, and so do b
+and n. For a and c, which still are such differences, two things help. All tokens are centred on a common vector, which
+changes no side but makes the norms small. And where the two tokens of a side are equal (repeated frames), what is left
+of it is rounding, which must not be taken for a direction: `_branch` says below which length a side counts as zero; its
+cosines are 0 and take no gradient. The bound is that of the inputs' type, so the products must be exact
+(`exact_matmul`).
+
+Loss and gradient come from one sweep over blocks of references that stay in cache; two arrays of R * K * m live during
+the sweep and none after it. Gradients go first to a, b and n (`_by_squares`), then, by further products, to p and q
+(`_by_tokens`).
+Source: docs/method.md, "Angle terms by matrix products".
 """
 
 from dataclasses import dataclass
@@ -47,10 +63,11 @@ def _inverse_root(square: Tensor) -> Tensor:
 
 
 def _branch(p: Tensor, q: Tensor, k: Tensor, centre: Tensor) -> _Branch:
-    """Two matrix products; see the module's docstring.
+    """The two matrix products and which sides have length zero.
 
-    Squared lengths that come from products are zero up to rounding of their operands. Two tokens that are bitwise equal
-    (repeated frames) leave less than 2 eps of that scale, the shortest genuine side measured was above 8e5 eps.
+    A squared side that comes from products is only known up to rounding, a few eps of the squared norms that went into
+    it. Two tokens that are bitwise equal leave less than 2 eps of that scale, the shortest genuine side measured was
+    above 8e5 eps: 8 eps tells them apart.
     """
     u = torch.empty_like(k)
     u_square = k.new_empty(k.shape[:-1])
@@ -143,11 +160,11 @@ def _sweep(
     terms = []
     by_a, by_b, by_n = torch.empty_like(student.pq_square), torch.empty_like(student.u_square), teacher.u_dot_q
     for part in blocks(references, block_elements(student.p) // (batch * anchors * queries)):
-        found, wanted = _triangles(student, part), _triangles(teacher, part)
+        sides, teacher_sides = _triangles(student, part), _triangles(teacher, part)
         differences = (
-            wanted.at_p.neg_().add_(found.at_p),
-            wanted.at_k.neg_().add_(found.at_k),
-            wanted.at_q.neg_().add_(found.at_q),
+            teacher_sides.at_p.neg_().add_(sides.at_p),
+            teacher_sides.at_k.neg_().add_(sides.at_k),
+            teacher_sides.at_q.neg_().add_(sides.at_q),
         )
         terms.append(torch.stack([_penalty_sum(difference, delta) for difference in differences]))
         if with_gradient:
@@ -156,7 +173,7 @@ def _sweep(
                 for difference, weight in zip(differences, weights, strict=True)
             )
             # The first slope, and so the gradient by n, lives in the teacher's `u_dot_q`.
-            by_a[:, part], by_b[:, part], _ = _by_squares(found, (slope_p, slope_k, slope_q))
+            by_a[:, part], by_b[:, part], _ = _by_squares(sides, (slope_p, slope_k, slope_q))
     return torch.stack(terms).sum(0) / student.u_dot_q.numel(), (by_a, by_b, by_n) if with_gradient else None
 
 
@@ -190,8 +207,8 @@ class _AngleTerms(torch.autograd.Function):
     def backward(ctx, grad_loss: Tensor | None, *_) -> tuple[Tensor | None, ...]:
         if grad_loss is None:
             return (None,) * 7
-        found = [(grad * grad_loss).to(dtype) for grad, dtype in zip(ctx.saved_tensors, ctx.dtypes, strict=True)]
-        return (*found, None, None, None, None, None)
+        scaled = [(grad * grad_loss).to(dtype) for grad, dtype in zip(ctx.saved_tensors, ctx.dtypes, strict=True)]
+        return (*scaled, None, None, None, None, None)
 
 
 def angle_loss(
@@ -207,7 +224,8 @@ def angle_loss(
 
     student, teacher: (p (B, R, C), q (B, m, C)) of that branch; anchors: k (B, R, K, C), teacher tokens used by
     both. Each mean is that of |cos - cos'| (`l1`) or of its Huber penalty with `huber_delta`. Only the first
-    result carries a gradient, and only to the student. Source: the paper's Phi term; specs sections 2, 3.1 and 7.1.
+    result carries a gradient, and only to the student. Source: the paper's Phi, see `equations`; for `huber`
+    docs/method.md, "Paper and released code".
     """
     delta = None if penalty == "l1" else huber_delta
     constants = (tensor.detach() for tensor in (*teacher, anchors))
