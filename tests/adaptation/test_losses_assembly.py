@@ -185,9 +185,8 @@ def test_anchors_are_those_of_the_draw():
     config = CONFIGS["released-da3"]
     draws = draws_for(config)
     held_out = teacher[11][0][:, 1::2].flatten(1, 2)
-    for draw, found in zip(
-        (draws.angle, draws.distance), vars(targets_of(teacher, KEPT, draws, config).anchors).values()
-    ):
+    anchors = targets_of(teacher, KEPT, draws, config).anchors
+    for draw, found in ((draws.angle, anchors.angle), (draws.distance, anchors.distance)):
         wanted = search_anchors(teacher[11][0][:, 0, draw.reference], held_out, num_anchors=4, selection="mixed")
         assert all(torch.equal(found[b], held_out[b][wanted[b]]) for b in range(2))
 
