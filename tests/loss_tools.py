@@ -1,14 +1,9 @@
 """The teacher's side of the loss, from its features of all views."""
 
-from freegeo.adaptation.losses import TeacherTargets, held_out_tokens, teacher_targets
+from freegeo.adaptation.losses import held_out_tokens
 
 
-def kept_levels(levels, kept):
-    """The features of the kept views, per layer."""
-    return {layer: (patch[:, kept], special[:, kept]) for layer, (patch, special) in levels.items()}
-
-
-def targets_of(levels, kept, draws, config) -> TeacherTargets:
-    """What the loss compares a student of the `kept` views with; `levels` are the teacher's of all views."""
-    held_out = held_out_tokens(levels[max(levels)], kept, config)
-    return teacher_targets(kept_levels(levels, kept), held_out, draws, config)
+def teacher_side(levels, kept, config):
+    """The features of the kept views per layer, and the held-out tokens; `levels` are the teacher's of all views."""
+    kept_levels = {layer: (patch[:, kept], special[:, kept]) for layer, (patch, special) in levels.items()}
+    return kept_levels, held_out_tokens(levels[max(levels)], kept, config)

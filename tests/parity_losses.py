@@ -18,11 +18,10 @@ from freegeo.adaptation.losses import (
     StepDraws,
     TokenDraw,
     adaptation_loss,
-    held_out_tokens,
 )
-from freegeo.adaptation.losses.targets import anchor_positions
+from freegeo.adaptation.losses.sampling import anchor_positions
 from freegeo.adaptation.recipe import PAPER, RELEASED_DA3, RELEASED_VGGT
-from loss_tools import kept_levels, targets_of
+from loss_tools import teacher_side
 
 Levels = dict[int, tuple[Tensor, Tensor]]
 WITHOUT_INTRA = {"weight_huber": 0.0, "weight_cosine": 0.0}
@@ -69,8 +68,8 @@ def _anchor_error(found: Tensor, wanted: Tensor) -> float:
 
 
 def _found_anchors(level: tuple[Tensor, Tensor], kept: list[int], draw: TokenDraw, config: LossConfig) -> Tensor:
-    (views,) = kept_levels({0: level}, kept).values()
-    return anchor_positions(views, held_out_tokens(level, kept, config), replace(draw, anchor=None), config)
+    levels, held_out = teacher_side({0: level}, kept, config)
+    return anchor_positions(levels[0], held_out, replace(draw, anchor=None), config)
 
 
 def _split(features: Tensor, special_tokens: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -83,7 +82,7 @@ def _loss_and_gradients(
 ) -> tuple[dict[str, Tensor], dict[int, Tensor]]:
     """Terms, and per layer the gradient of the total over [special tokens, patches] (B, M, T + P, C)."""
     inputs = {layer: tuple(part.clone().requires_grad_() for part in level) for layer, level in levels.items()}
-    total, terms = adaptation_loss(inputs, targets_of(teacher, kept, draws, config), draws, config)
+    total, terms = adaptation_loss(inputs, *teacher_side(teacher, kept, config), draws, config)
     total.backward()
     zero = {
         layer: [torch.zeros_like(p) if p.grad is None else p.grad for p in parts] for layer, parts in inputs.items()

@@ -15,13 +15,14 @@ from torch import nn
 from freegeo.adaptation import adapt as adapting
 from freegeo.adaptation.adapt import adapt, learning_rate
 from freegeo.adaptation.adapter import Adapter, PackedDropout
-from freegeo.adaptation.losses import adaptation_loss, draw_tokens, feature_distance, held_out_tokens, teacher_targets
+from freegeo.adaptation.losses import adaptation_loss, draw_tokens, feature_distance
 from freegeo.adaptation.memory import Plan
 from freegeo.adaptation.recipe import paper, released
 from freegeo.adaptation.samples import SceneImages, released_augmentation
 from freegeo.adaptation.views import schedule
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.models.precision import Compute
+from loss_tools import teacher_side
 from tiny_models import PATCH, noise, noise_scene, outputs, quick, same, tensors, tiny_da3, tiny_vggt
 
 IMAGES = noise(4)
@@ -69,7 +70,6 @@ def plain_adaptation(model, scenes, recipe, seed=42):
                 images = released_augmentation(images, visit.view_set.seed)
             with torch.no_grad(), adapter.off():
                 teacher = features(images)
-            levels = {layer: (patch[:, kept], special[:, kept]) for layer, (patch, special) in teacher.items()}
             patch, special = teacher[max(teacher)]
             draws = draw_tokens(
                 recipe.loss,
@@ -78,10 +78,9 @@ def plain_adaptation(model, scenes, recipe, seed=42):
                 held_out_views=len(images) - len(kept),
                 generator=torch.Generator().manual_seed(seed * 1_000_003 + step),
             )
-            held_out = held_out_tokens((patch, special), kept, recipe.loss)
-            targets = teacher_targets(levels, held_out, draws, recipe.loss)
+            levels, held_out = teacher_side(teacher, kept, recipe.loss)
             model.train(recipe.dropout > 0)
-            loss, _ = adaptation_loss(features(images[kept]), targets, draws, recipe.loss)
+            loss, _ = adaptation_loss(features(images[kept]), levels, held_out, draws, recipe.loss)
             (loss * (1 / len(visits))).backward()
             if recipe.hold:
                 held = recipe.hold * feature_distance(features(images), teacher, recipe.loss)[0]

@@ -1,4 +1,4 @@
-"""Draws, teacher targets and the assembled loss: what takes part and how gradients behave."""
+"""Draws, anchors and the assembled loss: what takes part and how gradients behave."""
 
 from dataclasses import FrozenInstanceError, replace
 
@@ -12,10 +12,10 @@ from freegeo.adaptation.losses import (
     require_finite,
     teacher_spread,
 )
-from freegeo.adaptation.losses.sampling import search_anchors
+from freegeo.adaptation.losses.sampling import anchor_tokens, search_anchors
 from freegeo.adaptation.recipe import PAPER, RELEASED_DA3, RELEASED_VGGT
 from freegeo.errors import FreeGeoError, UserError
-from loss_tools import targets_of
+from loss_tools import teacher_side
 
 KEPT = [0, 2, 4, 6]
 CONFIGS = {
@@ -47,7 +47,7 @@ def draws_for(config, seed=1, special=3):
 
 def loss_and_gradient(student, teacher, config, scale=1.0, **settings):
     draws = draws_for(config)
-    loss, terms = adaptation_loss(student, targets_of(teacher, KEPT, draws, config), draws, config, **settings)
+    loss, terms = adaptation_loss(student, *teacher_side(teacher, KEPT, config), draws, config, **settings)
     inputs = [part for level in student.values() for part in level]
     found = torch.autograd.grad(scale * loss, inputs, allow_unused=True)
     return terms, [torch.zeros_like(part) if grad is None else grad for part, grad in zip(inputs, found, strict=True)]
@@ -58,7 +58,7 @@ def test_student_that_equals_the_teacher_has_no_loss(config):
     _, teacher = features()
     student = {layer: tuple(part[:, KEPT].clone() for part in level) for layer, level in teacher.items()}
     draws = draws_for(config)
-    _, terms = adaptation_loss(student, targets_of(teacher, KEPT, draws, config), draws, config)
+    _, terms = adaptation_loss(student, *teacher_side(teacher, KEPT, config), draws, config)
     assert all(abs(term) < 1e-6 for term in terms.values())
 
 
@@ -96,7 +96,7 @@ def test_gradient_is_linear_in_the_scale_and_survives_a_second_pass(config):
     for small, large in zip(once, scaled, strict=True):
         torch.testing.assert_close(65536.0 * small, large)
     draws = draws_for(config)
-    loss, _ = adaptation_loss(student, targets_of(teacher, KEPT, draws, config), draws, config)
+    loss, _ = adaptation_loss(student, *teacher_side(teacher, KEPT, config), draws, config)
     loss.backward(retain_graph=True)
     loss.backward()
     for part, single in zip((part for level in student.values() for part in level), once, strict=True):
@@ -126,7 +126,8 @@ def test_a_given_form_equals_the_measured_one():
     config = CONFIGS["paper"]
     student, teacher = features()
     draws = draws_for(config)
-    spread = teacher_spread(targets_of(teacher, KEPT, draws, config), draws, config)
+    levels, held_out = teacher_side(teacher, KEPT, config)
+    spread = teacher_spread(levels[11], held_out, draws, config)
     measured, _ = loss_and_gradient(student, teacher, config)
     given, _ = loss_and_gradient(student, teacher, config, form=choose_form(float(spread), headroom=1.25))
     assert all(measured[name] == given[name] for name in measured)
@@ -156,10 +157,10 @@ def test_random_anchors_are_part_of_the_draw():
     student, teacher = features()
     draws = draws_for(config)
     assert draws.angle.anchor.shape == (20, 4) and int(draws.angle.anchor.max()) < 80
-    targets = targets_of(teacher, KEPT, draws, config)
-    held_out = teacher[11][0][:, 1::2].flatten(1, 2)
-    assert torch.equal(targets.anchors.angle, held_out[:, draws.angle.anchor])
-    assert torch.isfinite(adaptation_loss(student, targets, draws, config)[0])
+    levels, held_out = teacher_side(teacher, KEPT, config)
+    assert torch.equal(held_out, teacher[11][0][:, 1::2].flatten(1, 2))
+    assert torch.equal(anchor_tokens(levels[11], held_out, draws, config)[0], held_out[:, draws.angle.anchor])
+    assert torch.isfinite(adaptation_loss(student, levels, held_out, draws, config)[0])
 
 
 def test_mixed_anchors_are_the_most_and_the_least_similar():
@@ -185,8 +186,9 @@ def test_anchors_are_those_of_the_draw():
     config = CONFIGS["released-da3"]
     draws = draws_for(config)
     held_out = teacher[11][0][:, 1::2].flatten(1, 2)
-    anchors = targets_of(teacher, KEPT, draws, config).anchors
-    for draw, found in ((draws.angle, anchors.angle), (draws.distance, anchors.distance)):
+    levels, _ = teacher_side(teacher, KEPT, config)
+    anchors = anchor_tokens(levels[11], held_out, draws, config)
+    for draw, found in zip((draws.angle, draws.distance), anchors, strict=True):
         wanted = search_anchors(teacher[11][0][:, 0, draw.reference], held_out, num_anchors=4, selection="mixed")
         assert all(torch.equal(found[b], held_out[b][wanted[b]]) for b in range(2))
 
@@ -224,9 +226,9 @@ def test_what_cannot_work_is_refused():
             generator=torch.Generator(),
         )
     with pytest.raises(UserError, match="keeps every view"):
-        targets_of(teacher, list(range(8)), draws, config)
+        teacher_side(teacher, list(range(8)), config)
     with pytest.raises(FreeGeoError, match="same layers"):
-        adaptation_loss({5: student[5]}, targets_of(teacher, KEPT, draws, config), draws, config)
+        adaptation_loss({5: student[5]}, *teacher_side(teacher, KEPT, config), draws, config)
     with pytest.raises(FrozenInstanceError):
         config.temperature = 2.0
 

@@ -17,7 +17,7 @@ from freegeo.adaptation.losses.angles import angle_loss
 from freegeo.adaptation.losses.divergence import all_pairs_divergence, pair_spread, paired_divergence
 from freegeo.adaptation.losses.intra import intra_loss
 from freegeo.adaptation.recipe import PAPER, RELEASED_VGGT
-from loss_tools import targets_of
+from loss_tools import teacher_side
 
 FLOAT64 = torch.float64
 
@@ -226,7 +226,7 @@ def test_paper_loss_equals_the_equations(settings, repeated):
     config = PAPER.changed(loss={"temperature": 2.0, "num_reference": 6, "num_query": 9, **settings}).loss
     draws = draw_tokens(config, tokens_per_view=12, student_views=4, held_out_views=4, generator=generator)
     levels = [{5: (tokens[:, :, 3:], tokens[:, :, :3])} for tokens in (student, teacher)]
-    found, terms = adaptation_loss(levels[0], targets_of(levels[1], kept, draws, config), draws, config)
+    found, terms = adaptation_loss(levels[0], *teacher_side(levels[1], kept, config), draws, config)
 
     others = [view for view in range(4) if view != config.reference_view]
     (p, q), (teacher_p, teacher_q) = (
@@ -258,8 +258,8 @@ def test_outlier_channels_at_temperature_one_keep_every_version_finite():
         tokens = 25 if config.cross_tokens == "all" else 20
         draws = draw_tokens(config, tokens_per_view=tokens, student_views=4, held_out_views=4, generator=generator)
         inputs = (student.clone().requires_grad_(), special[:, ::2].clone().requires_grad_())
-        targets = targets_of({0: (teacher, special)}, [0, 2, 4, 6], draws, config)
-        loss, terms = adaptation_loss({0: inputs}, targets, draws, config)
+        side = teacher_side({0: (teacher, special)}, [0, 2, 4, 6], config)
+        loss, terms = adaptation_loss({0: inputs}, *side, draws, config)
         loss.backward()
         assert all(term.isfinite() for term in terms.values())
         assert inputs[0].grad.isfinite().all() and inputs[1].grad.isfinite().all()

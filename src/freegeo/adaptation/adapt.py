@@ -24,7 +24,7 @@ from freegeo.adaptation.adapter_files import save_adapter
 from freegeo.adaptation.losses import adaptation_loss, feature_distance, require_finite
 from freegeo.adaptation.memory import Plan, plan_adaptation
 from freegeo.adaptation.recipe import Recipe
-from freegeo.adaptation.samples import Sample, Samples, SceneImages, loss_features, targets_of
+from freegeo.adaptation.samples import Sample, Samples, SceneImages, loss_features, step_draws
 from freegeo.adaptation.views import Visit, schedule
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import write_tensors
@@ -208,14 +208,15 @@ def _learn(
 ) -> dict[str, Tensor]:
     """Add the gradients of one view set, and return its share of the step's loss terms."""
     recipe, share = run.recipe, 1 / len(run.steps[visit.step])
-    targets, draws = targets_of(sample, visit, recipe.loss, seed=run.seed)
+    draws = step_draws(sample, visit, recipe.loss, seed=run.seed)
+    tokens, teacher = sample.student()
     with run.compute.autocast():
-        student = loss_features(adapter.model, sample.student()[0])
-    loss, terms = adaptation_loss(student.levels, targets, draws, recipe.loss, form=sample.form)
+        student = loss_features(adapter.model, tokens)
+    loss, terms = adaptation_loss(student.levels, teacher, sample.held_out, draws, recipe.loss, form=sample.form)
     scaler.scale(loss * share).backward()
     if recipe.hold:
         # Not in the paper: with all views the adapted features shall stay where the frozen ones are.
-        del student, loss
+        del tokens, teacher, student, loss
         with run.compute.autocast():
             adapted = loss_features(adapter.model, sample.tokens)
         held = recipe.hold * feature_distance(adapted.levels, sample.teacher.levels, recipe.loss)[0]

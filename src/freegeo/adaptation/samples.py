@@ -25,12 +25,10 @@ from freegeo.adaptation.losses import (
     KLForm,
     Level,
     StepDraws,
-    TeacherTargets,
     choose_form,
     draw_tokens,
     held_out_tokens,
     teacher_spread,
-    teacher_targets,
 )
 from freegeo.adaptation.recipe import LossConfig, Recipe
 from freegeo.adaptation.views import ViewSet, Visit
@@ -219,7 +217,8 @@ class Samples:
         if self._compute.device.type == "cpu" or not config.uses_distances or config.pairing != "all":
             return sample
         # Read once per view set instead of in every step, where an accelerator would have to wait for it.
-        spread = teacher_spread(*targets_of(sample, visit, config, seed=self._seed), config)
+        levels, draws = sample.student()[1], step_draws(sample, visit, config, seed=self._seed)
+        spread = teacher_spread(levels[max(levels)], sample.held_out, draws, config)
         return replace(sample, form=choose_form(float(spread), headroom=SPREAD_HEADROOM))
 
     def _in_file(self, sample: Sample) -> Sample:
@@ -249,18 +248,16 @@ def loss_features(model: ReconstructionModel, tokens: ViewTokens) -> Features:
     return model.aggregate(tokens, layers=model.spec.loss_layers, reference="first")
 
 
-def targets_of(sample: Sample, visit: Visit, config: LossConfig, *, seed: int) -> tuple[TeacherTargets, StepDraws]:
-    """Draw the tokens of a visit, a function of seed and step alone, and gather the teacher's side of the loss."""
-    kept = sample.student()[1]
-    patch, special = kept[max(kept)]
-    draws = draw_tokens(
+def step_draws(sample: Sample, visit: Visit, config: LossConfig, *, seed: int) -> StepDraws:
+    """Draw the tokens of a visit: a function of seed and step alone."""
+    patch, special = sample.teacher.levels[max(sample.teacher.levels)]
+    return draw_tokens(
         config,
         tokens_per_view=patch.shape[2] + (special.shape[2] if config.cross_tokens == "all" else 0),
         student_views=len(visit.view_set.kept),
         held_out_views=len(visit.view_set.frames) - len(visit.view_set.kept),
         generator=torch.Generator().manual_seed(seed * DRAW_SEED_STRIDE + visit.step),
     ).to(patch.device)
-    return teacher_targets(kept, sample.held_out, draws, config), draws
 
 
 def loaded_ahead(scenes: Sequence[SceneImages], view_sets: Sequence[ViewSet]) -> Generator[Tensor]:

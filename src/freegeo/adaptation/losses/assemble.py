@@ -14,15 +14,22 @@ from freegeo.adaptation.losses.angles import angle_loss
 from freegeo.adaptation.losses.divergence import KLForm, all_pairs_divergence, pair_spread, paired_divergence
 from freegeo.adaptation.losses.intra import intra_loss
 from freegeo.adaptation.losses.numerics import widened
-from freegeo.adaptation.losses.sampling import StepDraws, TokenDraw
-from freegeo.adaptation.losses.targets import Level, TeacherTargets, cross_tokens, intra_special
+from freegeo.adaptation.losses.sampling import (
+    Level,
+    StepDraws,
+    TokenDraw,
+    anchor_tokens,
+    cross_tokens,
+    intra_special,
+)
 from freegeo.adaptation.recipe import LossConfig
 from freegeo.errors import FreeGeoError
 
 
 def adaptation_loss(
     student_levels: Mapping[int, Level],
-    teacher: TeacherTargets,
+    teacher_levels: Mapping[int, Level],
+    held_out: Tensor,
     draws: StepDraws,
     config: LossConfig,
     *,
@@ -30,41 +37,46 @@ def adaptation_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The total loss of one step (scalar, float32 or wider) and its detached terms.
 
-    student_levels: per loss layer the patches (B, M, P, C) and special tokens (B, M, T, C) of the kept views; the intra
-    loss is the mean over layers, the relational loss reads the highest layer number. draws: those that `teacher` was
-    made with, on any device; on the features' device nothing has to be moved. form: see `all_pairs_divergence`; only
-    `pairing` "all" reads it, and None costs one host read per distance term there.
+    Args:
+        student_levels: per loss layer the patches (B, M, P, C) and special tokens (B, M, T, C) of the kept views. The
+            intra loss is the mean over layers, the relational loss reads the highest layer number.
+        teacher_levels: the same of the teacher, which saw all views; no gradient goes there.
+        held_out: (B, L, C), what `held_out_tokens` returned for the highest layer: the tokens that anchors come from.
+        draws: token positions, on any device; on the features' device nothing has to be moved.
+        config: which version of the loss.
+        form: see `all_pairs_divergence`; only `pairing` "all" reads it, and None costs a host read per term there.
 
     Terms: `total`; `intra` (weighted) and its unweighted parts `huber` and `cos` (mean of 1 - cosine); `cross`
     (weighted); unweighted `phi1`, `phi2`, `phi3` (angles at reference, anchor, query) and `phi` (weighted sum);
     unweighted `kl_pk`, `kl_pq`, `kl_kq`. Terms of weight 0 are absent. Raises `FreeGeoError` where the teacher's
     layers are not the student's. Source: docs/method.md, "Equations of the paper" and "Paper and released code".
     """
-    if student_levels.keys() != teacher.kept.keys():
+    if student_levels.keys() != teacher_levels.keys():
         raise FreeGeoError(
             f"The student's features come from layers {sorted(student_levels)}, the teacher's from "
-            f"{sorted(teacher.kept)}; ask both branches for the same layers."
+            f"{sorted(teacher_levels)}; ask both branches for the same layers."
         )
-    total, terms = feature_distance(student_levels, teacher.kept, config)
+    total, terms = feature_distance(student_levels, teacher_levels, config)
     cross: list[Tensor] = []
     if config.uses_angles or config.uses_distances:
         layer = max(student_levels)
         student_draws, teacher_draws = (
             _gather_draws(cross_tokens(config, levels[layer]), draws, config)
-            for levels in (student_levels, teacher.kept)
+            for levels in (student_levels, teacher_levels)
         )
+        angle_anchors, distance_anchors = anchor_tokens(teacher_levels[layer], held_out, draws, config)
         if config.uses_angles:
             p_and_q = (_pooled(student_draws[0]), _pooled(teacher_draws[0]))
             phi, parts = angle_loss(
                 *p_and_q,
-                teacher.anchors.angle,
+                angle_anchors,
                 weights=config.angle_weights,
                 penalty=config.angle_penalty,
                 huber_delta=config.angle_huber_delta,
             )
             cross.append(phi)
             terms |= {"phi1": parts[0], "phi2": parts[1], "phi3": parts[2], "phi": phi}
-        distances = _distances(student_draws[1], teacher_draws[1], teacher.anchors.distance, config, form)
+        distances = _distances(student_draws[1], teacher_draws[1], distance_anchors, config, form)
         for name, (weight, value) in distances.items():
             cross.append(weight * value)
             terms[name] = value
@@ -196,14 +208,14 @@ def _outer(kl: Tensor, config: LossConfig) -> Tensor:
     return F.smooth_l1_loss(kl, torch.zeros_like(kl), beta=config.outer_beta, reduction="none")
 
 
-def teacher_spread(teacher: TeacherTargets, draws: StepDraws, config: LossConfig) -> Tensor:
+def teacher_spread(kept: Level, held_out: Tensor, draws: StepDraws, config: LossConfig) -> Tensor:
     """The largest spread of the teacher's softmax inputs over the pairs of `pairing` "all", a scalar tensor.
 
-    Read once per view set, `choose_form(spread, headroom=...)` spares the step its host reads.
+    kept: the teacher's features of the kept views at the cross layer; the rest as in `adaptation_loss`. Read once per
+    view set, `choose_form(spread, headroom=...)` spares the step its host reads.
     """
-    tokens = cross_tokens(config, teacher.kept[max(teacher.kept)])
-    p, q = _pooled(_gather_draws(tokens, draws, config)[1])
-    anchors = widened(teacher.anchors.distance).flatten(1, 2)
+    p, q = _pooled(_gather_draws(cross_tokens(config, kept), draws, config)[1])
+    anchors = widened(anchor_tokens(kept, held_out, draws, config)[1]).flatten(1, 2)
     return torch.stack([pair_spread(x, q, config.temperature) for x in (p, anchors)]).amax()
 
 

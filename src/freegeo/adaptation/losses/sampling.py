@@ -1,9 +1,10 @@
-"""Which tokens form the triplets: random references and queries, anchors by similarity to the reference.
+"""Which tokens take part: those of the intra loss, random references and queries, anchors by similarity.
 
 Draws are separate from the loss: they can be made in advance from the seed of a run, kept beside a teacher cache, or be
 replaced by recorded indices. One draw is shared by the samples of a batch (docs/method.md, "Token draws").
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,7 +15,33 @@ from freegeo.adaptation.losses.numerics import blocks, exact_matmul, widened
 from freegeo.adaptation.recipe import LossConfig, Selection
 from freegeo.errors import UserError
 
+Level = tuple[Tensor, Tensor]
+"""Features of one layer: patches (B, S, P, C) and special tokens (B, S, T, C), the camera token first."""
 SIMILARITY_ELEMENTS = 1 << 24  # one block of the similarity matrix: 64 MB in float32
+
+
+def intra_special(config: LossConfig, special: Tensor) -> Tensor:
+    """The special tokens (..., T', C) that enter the intra loss: none, the camera token, or all."""
+    return special[..., : {"patches": 0, "camera+patches": 1, "all": special.shape[-2]}[config.intra_tokens], :]
+
+
+def cross_tokens(config: LossConfig, level: Level) -> Tensor:
+    """The tokens (B, S, T + P, C) or (B, S, P, C) of a layer that triplets are drawn from."""
+    patch, special = level
+    return torch.cat([special, patch], dim=-2) if config.cross_tokens == "all" else patch
+
+
+def held_out_tokens(level: Level, kept: Sequence[int], config: LossConfig) -> Tensor:
+    """The tokens (B, L, C) that anchors are chosen from: those of the views that the student does not see.
+
+    level: the teacher's features of the cross layer, all N views; kept: the student's views among them. UserError
+    where the student sees every view.
+    """
+    tokens = cross_tokens(config, level)
+    views = [view for view in range(tokens.shape[1]) if view not in set(kept)]
+    if not views:
+        raise UserError("The student keeps every view of the teacher; hold out at least one for the anchors.")
+    return tokens[:, views].flatten(1, 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,3 +147,25 @@ def search_anchors(reference: Tensor, held_out: Tensor, *, num_anchors: int, sel
             farthest = similarity.topk(num_anchors - most, dim=-1, largest=False).indices
             chosen.append(torch.cat([nearest, farthest], dim=-1))
     return torch.cat(chosen, dim=1)
+
+
+def anchor_positions(kept: Level, held_out: Tensor, draw: TokenDraw, config: LossConfig) -> Tensor:
+    """Positions (B, R, K) of a draw's anchors among the held-out tokens (B, L, C), as drawn or found by similarity.
+
+    kept: the teacher's features of the kept views at the cross layer. UserError where there are fewer held-out tokens
+    than anchors.
+    """
+    if draw.anchor is not None:
+        return draw.anchor.to(held_out.device).expand(len(held_out), -1, -1)
+    reference = cross_tokens(config, kept)[:, config.reference_view, draw.reference.to(held_out.device)]
+    return search_anchors(reference, held_out, num_anchors=config.num_anchors, selection=config.selection)
+
+
+@torch.no_grad()
+def anchor_tokens(kept: Level, held_out: Tensor, draws: StepDraws, config: LossConfig) -> tuple[Tensor, Tensor]:
+    """The anchors (B, R, K, C) of the angle draw and of the distance draw; one tensor where the terms share a draw."""
+    batch = torch.arange(len(held_out), device=held_out.device)[:, None, None]
+    angle = held_out[batch, anchor_positions(kept, held_out, draws.angle, config)]
+    if draws.shared:
+        return angle, angle
+    return angle, held_out[batch, anchor_positions(kept, held_out, draws.distance, config)]
