@@ -1,4 +1,4 @@
-"""CPU seconds, memory and loss of adaptation steps: a plain reference, then the engine with its measures in turn.
+"""CPU seconds, memory and loss of adaptation steps: a plain reference, then freegeo with its memory plans in turn.
 
 Run: python benchmarks/adaptation.py CASE... [--out benchmarks/results]     (cases: see CASES below)
 
@@ -27,46 +27,35 @@ SCENES = 3
 
 VARIANTS: dict[str, dict] = {
     "plain": {"plain": True},
-    "engine, nothing kept": {"share_prefix": False, "cache_teacher": False},
-    "+ prefix once per image": {"cache_teacher": False},
-    "+ teacher once per view set": {},
-    "+ checkpointing": {"recompute_blocks": True},
-    "+ cache on disk": {"cache_place": "disk"},
-    "+ cache in half precision": {"half_cache": True},
+    "freegeo": {},
+    "freegeo, checkpointing": {"checkpointing": True},
+    "freegeo, samples on disk": {"place": "disk"},
 }
 CASES: dict[str, dict] = {
     "small-112": {"model": "da3-small", "px": 112, "recipe": "released-da3", "plain_steps": 3},
+    "small-112-hold": {"model": "da3-small", "px": 112, "recipe": "paper", "hold": 1.0, "variants": ["freegeo"]},
     "small-224": {"model": "da3-small", "px": 224, "recipe": "released-da3", "plain_steps": 1},
-    "small-224-paper": {
-        "model": "da3-small", "px": 224, "recipe": "paper", "variants": ["+ teacher once per view set"],
-    },
+    "small-224-paper": {"model": "da3-small", "px": 224, "recipe": "paper", "variants": ["freegeo"]},
     "base-112": {
-        "model": "da3-base", "px": 112, "recipe": "released-da3", "plain_steps": 1,
-        "variants": ["plain", "engine, nothing kept", "+ teacher once per view set"],
+        "model": "da3-base", "px": 112, "recipe": "released-da3", "plain_steps": 1, "variants": ["plain", "freegeo"],
     },
     "base-224": {
         "model": "da3-base", "px": 224, "recipe": "released-da3", "plain_steps": 1,
-        "variants": ["plain", "+ teacher once per view set", "+ checkpointing"],
+        "variants": ["plain", "freegeo", "freegeo, checkpointing"],
     },
     "vggt-112": {
         "model": "vggt-small-shape", "px": 112, "recipe": "released-vggt", "plain_steps": 1,
-        "variants": ["plain", "engine, nothing kept", "+ teacher once per view set", "+ checkpointing"],
+        "variants": ["plain", "freegeo", "freegeo, checkpointing"],
     },
     "vggt-224": {
         "model": "vggt-small-shape", "px": 224, "recipe": "released-vggt", "plain_steps": 1,
-        "variants": ["plain", "+ teacher once per view set"],
+        "variants": ["plain", "freegeo"],
     },
     "small-518": {
-        "model": "da3-small", "px": 518, "recipe": "released-da3", "epochs": 2, "scenes": 1,
-        "variants": ["+ teacher once per view set"],
-    },
-    "batch-112": {
-        "model": "da3-small", "px": 112, "recipe": "paper", "batch": 3,
-        "variants": ["+ teacher once per view set", "+ micro-batches of 3"],
+        "model": "da3-small", "px": 518, "recipe": "released-da3", "epochs": 2, "scenes": 1, "variants": ["freegeo"],
     },
     "curve-112": {"model": "da3-small", "px": 112, "recipe": "paper", "curve": True},
 }  # fmt: skip
-VARIANTS["+ micro-batches of 3"] = {"micro_batch": 3}
 
 
 def build_model(name: str):
@@ -100,7 +89,7 @@ def build_recipe(model, case: dict):
     recipe = named(case["recipe"], model.spec, "eth3d")
     # `released-vggt` draws new views in every epoch; keeping them shows what keeping the teacher gives.
     return recipe.changed(
-        sets_per_scene=1, distinct_seeds=1, batch=case.get("batch", 1), epochs=case.get("epochs", 2), redraw=False
+        sets_per_scene=1, distinct_seeds=1, batch=1, epochs=case.get("epochs", 2), redraw=False, hold=case.get("hold")
     )
 
 
@@ -108,12 +97,12 @@ def scene_images(count: int, px: int):
     """Scenes of 8 noise images."""
     import torch
 
-    from freegeo.adaptation.images import SceneImages
+    from freegeo.adaptation.samples import SceneImages
 
     scenes = []
     for number in range(count):
         images = torch.rand(8, 3, px, px, generator=torch.Generator().manual_seed(number))
-        scenes.append(SceneImages(name=str(number), count=8, load=lambda f, i=images: i[list(f)], in_memory=True))
+        scenes.append(SceneImages(name=str(number), count=8, load=lambda f, i=images: i[list(f)]))
     return scenes
 
 
@@ -138,14 +127,14 @@ def work(job: dict) -> dict:
     import peft  # noqa: F401
     import torch
 
-    from freegeo.adaptation import trainer  # noqa: F401
+    from freegeo.adaptation import adapt  # noqa: F401
 
     torch.set_num_threads(1)
     before = resident_bytes()
     case, options = job["case"], VARIANTS[job["variant"]]
     model = build_model(case["model"])
     scenes = scene_images(case.get("scenes", SCENES), case["px"])
-    run = run_plain if options.get("plain") else run_engine
+    run = run_plain if options.get("plain") else run_freegeo
     result = run(model, scenes, build_recipe(model, case), case, options, job["tensors"])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     return {**result, "peak_above_start_mb": (peak - before) / 1e6, "load": os.getloadavg()[0]}
@@ -156,8 +145,8 @@ def run_plain(model, scenes, recipe, case: dict, _options: dict, tensors: str) -
     import torch
     from plain import PlainAdaptation
 
-    from freegeo.adaptation.images import released_augmentation
-    from freegeo.adaptation.trainer import learning_rate
+    from freegeo.adaptation.adapt import learning_rate
+    from freegeo.adaptation.samples import released_augmentation
     from freegeo.adaptation.views import schedule
 
     reference = PlainAdaptation(model, recipe, SEED)
@@ -174,19 +163,21 @@ def run_plain(model, scenes, recipe, case: dict, _options: dict, tensors: str) -
     return {"first_step_s": per_step, "later_step_s": per_step, "steps": len(seconds), "losses": losses}
 
 
-def run_engine(model, scenes, recipe, case: dict, options: dict, tensors: str) -> dict:
-    """A whole run of the engine; the loss is timed inside the steps."""
+def run_freegeo(model, scenes, recipe, case: dict, options: dict, tensors: str) -> dict:
+    """A whole run; the loss is timed inside the steps, and the teacher alone after each, under the same load."""
     import torch
 
-    from freegeo.adaptation import trainer
-    from freegeo.adaptation.engine import Engine
-    from freegeo.adaptation.planner import plan_adaptation
+    from freegeo.adaptation import adapt as adapting
+    from freegeo.adaptation.memory import Footprint
+    from freegeo.adaptation.views import schedule
+    from freegeo.models.precision import Compute
 
-    engine = Engine(**options)
-    planned = plan_adaptation(model, [(s.count, (case["px"],) * 2) for s in scenes], recipe, seed=SEED, engine=engine)
-    seconds, in_loss, teacher = [], [], []
+    steps = schedule([scene.count for scene in scenes], recipe, SEED)
+    options = {"place": "device", "checkpointing": False, **options}
+    plan = Footprint(model, scenes, recipe, steps, Compute()).plan(**options)
+    marks, seconds, in_loss, teacher = [0.0], [], [0.0], []
     images = scenes[0].load(range(8))
-    original = trainer.adaptation_loss
+    original = adapting.adaptation_loss
 
     def timed_loss(*args, **keywords):
         started = time.process_time()
@@ -194,29 +185,27 @@ def run_engine(model, scenes, recipe, case: dict, options: dict, tensors: str) -
         in_loss[-1] += time.process_time() - started
         return found
 
-    class TimedRun(trainer._Run):
-        """Times every step, and the teacher alone after it, so that both meet the same load of the machine."""
+    def after_step(progress) -> None:
+        seconds.append(time.process_time() - marks[-1])
+        teacher.append(teacher_seconds(model, images, adapters[0]))
+        in_loss.append(0.0)
+        marks.append(time.process_time())
 
-        def step(self, step: int):
-            in_loss.append(0.0)
-            started = time.process_time()
-            found = super().step(step)
-            seconds.append(time.process_time() - started)
-            teacher.append(teacher_seconds(self.adapter.model, images, self.adapter))
-            return found
-
-    trainer.adaptation_loss, trainer._Run = timed_loss, TimedRun
-    result = trainer.adapt(model, scenes, recipe, seed=SEED, engine=engine)
+    adapters = []
+    attach = adapting.Adapter.attach
+    adapting.Adapter.attach = lambda *args, **keywords: adapters.append(attach(*args, **keywords)) or adapters[0]
+    adapting.adaptation_loss = timed_loss
+    marks[0] = time.process_time()
+    result = adapting.adapt(model, scenes, recipe, seed=SEED, plan=plan, on_step=after_step)
     torch.save({n: p.detach() for n, p in result.adapter.named_parameters().items()}, tensors)
     epoch = len(seconds) // recipe.epochs
     return {
         "first_step_s": median(seconds[:epoch]),
         "later_step_s": median(seconds[epoch:]),
         "steps_s": seconds,
-        "epochs_s": [sum(seconds[i : i + epoch]) for i in range(0, len(seconds), epoch)],
-        "loss_s": median(in_loss),
+        "loss_s": median(in_loss[:-1]),
         "losses": [terms["total"] for terms in result.curve],
-        "planned_mb": planned.peak_bytes / 1e6,
+        "planned_mb": plan.peak_bytes / 1e6,
         "teacher_s": median(teacher),
     }
 
@@ -225,7 +214,7 @@ def curve(case: dict) -> dict:
     """CPU seconds per epoch for 1, 2 and 4 view sets."""
     import torch
 
-    from freegeo.adaptation import trainer
+    from freegeo.adaptation.adapt import adapt
 
     torch.set_num_threads(1)
     found = {}
@@ -234,8 +223,12 @@ def curve(case: dict) -> dict:
         recipe = build_recipe(model, case).changed(epochs=4)
         ends = []
         started = time.process_time()
-        trainer.adapt(
-            model, scene_images(sets, case["px"]), recipe, on_epoch=lambda *_, e=ends: e.append(time.process_time())
+        adapt(
+            model,
+            scene_images(sets, case["px"]),
+            recipe,
+            seed=SEED,
+            on_epoch=lambda *_, e=ends: e.append(time.process_time()),
         )
         found[f"{sets} view sets"] = [round(b - a, 3) for a, b in pairwise([started, *ends])]
     return {"cpu_s_per_epoch": found}
@@ -267,7 +260,7 @@ def run_case(name: str, only: list[str], before: dict) -> dict:
     case = CASES[name]
     if case.get("curve"):
         return spawn({"case": case, "curve": True})
-    variants = case.get("variants") or [v for v in VARIANTS if "micro" not in v]
+    variants = case.get("variants") or list(VARIANTS)
     results: dict[str, dict] = {}
     with tempfile.TemporaryDirectory() as folder:
         files: dict[str, str] = {}
@@ -278,7 +271,7 @@ def run_case(name: str, only: list[str], before: dict) -> dict:
             path = str(Path(folder) / f"{len(files)}.pt")
             found = spawn({"case": case, "variant": variant, "tensors": path})
             first = next(iter(results.values()))["losses"][0] if results else found["losses"][0]
-            # From the second step on the plain reference draws other dropout masks than the engine.
+            # From the second step on the plain reference draws other dropout masks.
             found["loss_difference"] = abs(found["losses"][0] - first) / abs(first)
             if variant != "plain":
                 files[variant] = path
@@ -291,7 +284,8 @@ def run_case(name: str, only: list[str], before: dict) -> dict:
 def table(name: str, results: dict) -> list[str]:
     """Markdown lines of one case."""
     case = CASES[name]
-    title = f"### {name}: {case['model']}, {case['px']} px, 8 -> 4, `{case['recipe']}`, batch {case.get('batch', 1)}"
+    hold = f", hold {case['hold']}" if "hold" in case else ""
+    title = f"### {name}: {case['model']}, {case['px']} px, 8 -> 4, `{case['recipe']}`{hold}"
     if "cpu_s_per_epoch" in results:
         rows = [f"| {sets} | " + " | ".join(map(str, s)) + " |" for sets, s in results["cpu_s_per_epoch"].items()]
         return [title, "", "| CPU s of epoch | 1 | 2 | 3 | 4 |", "|---|---|---|---|---|", *rows, ""]

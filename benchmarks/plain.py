@@ -1,4 +1,4 @@
-"""A plain adaptation step written from the equations: what the engine's speed and memory are compared with.
+"""A plain adaptation step written from the equations: what speed and memory are compared with.
 
 Two resident networks, nothing kept between steps, and every triplet formed explicitly in chunks of 64 references x 64
 queries whose intermediate arrays are checkpointed. It computes the recipes `released-da3` and `released-vggt`

@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from freegeo.adaptation import memory
 from freegeo.adaptation.adapt import adapt
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.memory import plan_adaptation, plan_reconstruction, shape_of
+from freegeo.adaptation.memory import Footprint, plan_adaptation, plan_reconstruction, shape_of
 from freegeo.adaptation.recipe import paper, scene
 from freegeo.adaptation.samples import Samples, SceneImages
 from freegeo.adaptation.views import schedule
@@ -135,7 +135,7 @@ def test_the_peak_is_that_of_the_tensors_alive(place, checkpointing, hold, tmp_p
     model = wide_da3()
     recipe = scene(model.spec).changed(epochs=2, batch=2, sets_per_scene=2, distinct_seeds=2, rank=8, hold=hold)
     scenes = [images(24, 128)]
-    job = memory._Job(model, scenes, recipe, schedule([24], recipe, 42), CPU)
+    job = Footprint(model, scenes, recipe, schedule([24], recipe, 42), CPU)
     plan = job.plan(place, checkpointing)
     weights = dict(plan.parts)["weights"]
     assert weights == sum(p.nbytes for p in model.parameters())

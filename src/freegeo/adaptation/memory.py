@@ -81,7 +81,7 @@ def plan_adaptation(
     files of samples would lie. The model may be on the meta device. UserError when nothing fits.
     """
     budget = available(compute.device) if budget is None else budget
-    job = _Job(model, scenes, recipe, steps, compute)
+    job = Footprint(model, scenes, recipe, steps, compute)
     free_disk = shutil.disk_usage(folder or tempfile.gettempdir()).free
     plans = [job.plan(place, checkpointing) for checkpointing in (False, True) for place in ("device", "disk")]
     for plan in plans:
@@ -95,7 +95,7 @@ def plan_adaptation(
     )
 
 
-class _Job:
+class Footprint:
     """What a run computes, as far as memory is concerned."""
 
     def __init__(
