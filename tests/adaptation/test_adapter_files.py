@@ -127,7 +127,7 @@ def test_published_files_have_the_published_names(name, tmp_path):
     assert torch.equal(token["camera_token"], adapter.camera_token)
 
 
-# Layers of the published files: fact sheet, section 3.5.
+# Layers of the published files: docs/method.md, "Adapter files".
 PUBLISHED_LAYERS = {
     "da3-giant": [
         f"blocks.{i}.{part}" for i in range(13, 40) for part in ("attn.qkv", "attn.proj", "mlp.w12", "mlp.w3")

@@ -11,7 +11,7 @@ from tiny_models import quick, tiny_da3
 
 MODEL = tiny_da3()
 
-# Frames -> drawn views for seeds 40, 41, 42 and 1000040: fact sheet, section 3.3.
+# Frames -> drawn views for seeds 40, 41, 42 and 1000040: docs/method.md, "Augmentation and view draws".
 SEEDS = (40, 41, 42, 1_000_040)
 DRAWS = {
     3: ("0 0 0 1 1 2 2 2", "0 0 0 1 1 1 1 2", "0 0 0 1 1 2 2 2", "0 0 1 1 2 2 2 2"),

@@ -32,7 +32,7 @@ class ViewSet:
 
 
 def draw_frames(count: int, views: int, seed: int, *, repeat: bool, neighbours: bool = False) -> tuple[int, ...]:
-    """Draw the frames of a view set from `count` frames (method's fact sheet, section 3.3), ascending.
+    """Draw the frames of a view set from `count` frames (docs/method.md, "Augmentation and view draws"), ascending.
 
     With at most `views` frames all are used; `repeat` then fills up with random repeats. `neighbours` (ours) draws
     the first frame only and takes those that follow it.
