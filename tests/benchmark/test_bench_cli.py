@@ -10,6 +10,10 @@ from freegeo.cli.app import main
 from freegeo.data.datasets import eth3d
 
 BENCH = fixture_path("benchmark", "datasets")
+RECIPE_OPTIONS = (
+    ("--lr", "0.5", "lr"), ("--rank", "2", "rank"), ("--keep", "0,3", "keep"), ("--sets", "2", "sets_per_scene"),
+    ("--teacher-views", "6", "views"), ("--hold", "1", "hold"),
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -76,9 +80,10 @@ def test_a_run_prints_and_stores_its_tables_and_a_second_one_does_nothing_again(
     assert "4 tasks, 4 of them finished" in out
     assert (tmp_path / "out" / "results.csv").read_text() == results
 
-    code, _, err = freegeo("predict", "main", *options, "--lr", "0.5")
-    assert code == 2
-    assert "adaptation.recipe.lr" in err
+    for option, value, setting in RECIPE_OPTIONS:
+        code, _, err = freegeo("predict", "main", *options, option, value)
+        assert code == 2
+        assert f"adaptation.recipe.{setting}: " in err
     assert freegeo("evaluate", "features", *options[:4])[0] in (0, 1)
 
 

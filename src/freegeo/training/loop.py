@@ -17,7 +17,7 @@ from torch import nn
 
 from freegeo import __version__
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import atomic_path, read_json, write_json, write_tensors
+from freegeo.files import as_json, atomic_path, read_json, write_json, write_tensors
 from freegeo.run_folder import locked
 from freegeo.training.batches import Batch, draw_batch
 from freegeo.training.config import TrainConfig
@@ -164,7 +164,7 @@ def apply_gradients(state: State, config: TrainConfig) -> None:
 
 def require_same_settings(config: TrainConfig, folder: Path) -> None:
     """Store the settings, or refuse to go on with other ones; only the view budget may change."""
-    settings, defaults = (json.loads(json.dumps(asdict(each))) for each in (config, TrainConfig()))
+    settings, defaults = (as_json(asdict(each)) for each in (config, TrainConfig()))
     path = folder / CONFIG
     if path.is_file():
         before = defaults | read_json(path)  # a run may be older than a setting
