@@ -333,7 +333,7 @@ def _evaluate(bench: BenchOptions, device: str | None, *, wanted: list[Task] | N
 def _tables(experiments: Sequence[str], bench: BenchOptions) -> None:
     """Print the tables as text and write them in every format."""
     from freegeo.benchmark.paper.experiments import chosen
-    from freegeo.benchmark.paper.tables import FORMATS, as_text, experiment_tables
+    from freegeo.benchmark.paper.tables import TABLE_WRITERS, as_text, experiment_tables
     from freegeo.benchmark.results import read_results
     from freegeo.files import atomic_path
 
@@ -346,7 +346,7 @@ def _tables(experiments: Sequence[str], bench: BenchOptions) -> None:
             continue
         for table in tables:
             console.say(f"\n{as_text(table)}")
-        for ending, layout in FORMATS.items():
+        for ending, layout in TABLE_WRITERS.items():
             with atomic_path(bench.output / TABLES / f"{entry.name}.{ending}") as part:
                 part.write_text("\n".join(layout(table) for table in tables), encoding="utf-8")
     console.say(f"tables: {bench.output / TABLES}")
