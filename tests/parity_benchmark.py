@@ -14,23 +14,22 @@ import numpy as np
 import torch
 
 from freegeo.benchmark import sampling
-from freegeo.benchmark.evaluate import (
+from freegeo.benchmark.frames import fusion_frames
+from freegeo.benchmark.scene_score import (
     fuse_scene,
     load_reference,
-    read_published_prediction,
     score_scene_poses,
     score_scene_surface,
-    select_views,
-    with_mean,
 )
-from freegeo.benchmark.frames import fusion_frames
 from freegeo.data.colmap_files import read_cameras, read_images
 from freegeo.data.datasets import registry as datasets
 from freegeo.data.datasets.scannetpp import undistorted
 from freegeo.fusion.mesh import Mesh, empty_mesh_substitute, sample_surface
 from freegeo.fusion.tsdf import TsdfVolume
+from freegeo.geometry.se3 import to_4x4
 from freegeo.metrics.cloud import score_clouds, voxel_average
 from freegeo.metrics.pose import pair_errors, pose_auc
+from freegeo.types import Prediction
 
 Case = tuple[str, Callable[[], float]]
 FAILED = float("inf")
@@ -278,15 +277,38 @@ def _reference(folder: Path, dataset: str, scene: str):
     return load_reference(_scene(folder, dataset, scene))
 
 
+def read_published_prediction(path: Path) -> Prediction:
+    """Read a result of the released evaluation; depth may carry a last dimension of one, extrinsics be (S, 3, 4)."""
+    with np.load(path, allow_pickle=False) as stored:
+        arrays = {key: torch.from_numpy(stored[key]) for key in ("depth", "extrinsics", "intrinsics")}
+    depth = arrays["depth"]
+    return Prediction(
+        depth_z=depth[..., 0] if depth.ndim == 4 else depth,
+        T_cam_world=to_4x4(arrays["extrinsics"]),
+        K=arrays["intrinsics"],
+    )
+
+
+def select_views(prediction: Prediction, views: list[int]) -> Prediction:
+    """The chosen views of an unbatched prediction, in the order given."""
+    return prediction.map(lambda tensor: tensor[views])
+
+
+def _with_mean(scores: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Scores per scene plus their plain mean, the layout of the released score files."""
+    keys = next(iter(scores.values()))
+    return {**scores, "mean": {key: float(np.mean([score[key] for score in scores.values()])) for key in keys}}
+
+
 def _parameter_error(dataset: str, recorded: dict) -> float:
-    rules = datasets.protocol(dataset)
+    fixed = datasets.constants(dataset)
     mine = {
-        "voxel_length": rules.voxel,
-        "sdf_trunc": rules.truncation,
-        "max_depth": rules.depth_limit,
-        "sampling_number": rules.samples,
-        "eval_threshold": rules.threshold,
-        "down_sample": rules.down_sample,
+        "voxel_length": fixed.voxel,
+        "sdf_trunc": fixed.truncation,
+        "max_depth": fixed.depth_limit,
+        "sampling_number": fixed.samples,
+        "eval_threshold": fixed.threshold,
+        "down_sample": fixed.down_sample,
     }
     return 0.0 if all(mine[key] == recorded[key] for key in mine) else FAILED
 
@@ -333,7 +355,7 @@ def _camera_error(folder: Path, scene: str, recorded: dict) -> float:
 def _gt_mask_error(folder: Path, dataset: str, scene: str, recorded: list) -> float:
     loaded = _scene(folder, dataset, scene)
     for index, expected in enumerate(recorded):
-        size_hw = datasets.protocol(dataset).fusion_hw or loaded.photos[index].size_hw
+        size_hw = datasets.constants(dataset).fusion_hw or loaded.photos[index].size_hw
         mask = datasets.valid_mask(loaded.truth, index, size_hw)
         mine = None if mask is None else {"shape": list(mask.shape), "valid": int(mask.sum())}
         if mine != expected:
@@ -395,8 +417,8 @@ def _run_error(folder: Path, dataset: str, views: str, seed: str, run: dict) -> 
         reference = _reference(folder, dataset, scene)
         surfaces[scene] = score_scene_surface(loaded, prediction, reference=reference).cloud.as_dict()
     worst = 0.0
-    for scene, score in with_mean(poses).items():
+    for scene, score in _with_mean(poses).items():
         worst = max(worst, *(_difference(score[key], value) / 1e-6 for key, value in run["pose"][scene].items()))
-    for scene, score in with_mean(surfaces).items():
+    for scene, score in _with_mean(surfaces).items():
         worst = max(worst, _surface_ratio(score, run["recon_unposed"][scene]))
     return worst

@@ -7,7 +7,3 @@ class FreeGeoError(Exception):
 
 class UserError(FreeGeoError, ValueError):
     """The request cannot be carried out as asked; the sentence says what to change (exit code 2)."""
-
-
-class FreeGeoWarning(UserWarning):
-    """Something in the request was set aside or changed; the result is still what the sentence says."""

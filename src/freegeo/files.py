@@ -18,10 +18,10 @@ from freegeo.errors import FreeGeoError, UserError
 
 FORMAT = 1
 """Version of the files that freegeo writes."""
-STATE_FILE = ".freegeo-run.json"
+RUN_FILE = ".freegeo-run.json"
 LOCK_FILE = ".freegeo-lock"
 LEDGER_FILE = ".freegeo-files"
-OWN_FILES = frozenset({STATE_FILE, LOCK_FILE, LEDGER_FILE})
+OWN_FILES = frozenset({RUN_FILE, LOCK_FILE, LEDGER_FILE})
 
 
 @contextmanager
@@ -60,10 +60,15 @@ def _flush(path: Path) -> None:
 def _enter_in_ledger(path: Path) -> None:
     """Note a file in the ledger of the run folder that it lies in, if it lies in one."""
     path = path.absolute()
-    owner = next((folder for folder in path.parents if (folder / STATE_FILE).is_file()), None)
+    owner = next((folder for folder in path.parents if (folder / RUN_FILE).is_file()), None)
     if owner is not None and path.name not in OWN_FILES:
         with (owner / LEDGER_FILE).open("a", encoding="utf-8") as file:
             file.write(path.relative_to(owner).as_posix() + "\n")
+
+
+def as_json(value: Any) -> Any:
+    """Return a value as it comes back from a JSON file: tuples become lists, keys text."""
+    return json.loads(json.dumps(value))
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import FORMAT, LEDGER_FILE, LOCK_FILE, OWN_FILES, STATE_FILE, read_json, write_json
+from freegeo.files import FORMAT, LEDGER_FILE, LOCK_FILE, OWN_FILES, RUN_FILE, as_json, read_json, write_json
 
 _SHOWN = 4
 _PART = re.compile(r"\..+\.[0-9a-f]{8}\.part(\..*)?")
@@ -88,7 +88,7 @@ class RunFolder:
 
     def finish(self) -> None:
         """Mark the result as complete."""
-        write_json(self.path / STATE_FILE, _state(self.settings, datetime.now(UTC).isoformat(timespec="seconds")))
+        write_json(self.path / RUN_FILE, _state(self.settings, datetime.now(UTC).isoformat(timespec="seconds")))
 
 
 @contextmanager
@@ -100,7 +100,7 @@ def run_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool = Fal
     UserError, unless `overwrite`, which removes what earlier runs wrote (and nothing else; a foreign folder is refused
     all the same). A block that is refused before it wrote anything leaves no trace.
     """
-    settings = json.loads(json.dumps(settings))
+    settings = as_json(settings)
     check_folder(path, settings, overwrite=overwrite)
     is_new = not path.exists()
     try:
@@ -110,7 +110,7 @@ def run_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool = Fal
                 yield RunFolder(path, settings, finished_at)
             except UserError:
                 if not _ledger(path):
-                    (path / STATE_FILE).unlink(missing_ok=True)
+                    (path / RUN_FILE).unlink(missing_ok=True)
                 raise
     finally:
         if is_new and path.is_dir() and not any(path.iterdir()):
@@ -126,7 +126,7 @@ def _open(path: Path, settings: Mapping[str, Any], overwrite: bool) -> str | Non
         clear(path)
         before = None
     if before is None:
-        write_json(path / STATE_FILE, _state(settings, None))
+        write_json(path / RUN_FILE, _state(settings, None))
         return None
     if not before["finished"]:
         _remove_parts(path)
@@ -135,7 +135,7 @@ def _open(path: Path, settings: Mapping[str, Any], overwrite: bool) -> str | Non
 
 def check_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool) -> None:
     """Raise UserError when `run_folder` would refuse; cheap, so that commands can ask before they load anything."""
-    settings = json.loads(json.dumps(settings))
+    settings = as_json(settings)
     if path.exists() and not path.is_dir():
         raise UserError(f"{path}: is a file. Choose a folder for the output.")
     before = stored_state(path)
@@ -149,7 +149,7 @@ def check_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool) ->
     if before["settings"] != settings and not overwrite:
         state = "a finished result" if before["finished"] else "an unfinished run"
         raise UserError(
-            f"{path}: holds {state} with other options ({_difference(before['settings'], settings)}). "
+            f"{path}: holds {state} with other options ({difference(before['settings'], settings)}). "
             "Add --overwrite to replace it, or choose another folder."
         )
     _require_writable(path)
@@ -157,7 +157,7 @@ def check_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool) ->
 
 def stored_state(path: Path) -> dict[str, Any] | None:
     """Return format, settings and finishing time of the run a folder holds; None when it holds none."""
-    file = path / STATE_FILE
+    file = path / RUN_FILE
     if not file.is_file():
         return None
     state = read_json(file)
@@ -171,7 +171,7 @@ def clear(path: Path) -> None:
     state = stored_state(path)
     if state is not None:
         # Should the removal be cut short, what is left must not pass for a finished result.
-        write_json(path / STATE_FILE, {**state, "finished": None})
+        write_json(path / RUN_FILE, {**state, "finished": None})
     files = [path / name for name in _ledger(path)]
     for file in files:
         if file.is_symlink() or file.is_file():
@@ -182,6 +182,16 @@ def clear(path: Path) -> None:
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
     (path / LEDGER_FILE).unlink(missing_ok=True)
+
+
+def difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Name the settings that differ, dotted where they are nested, with both values; empty when none does.
+
+    At most four are named, of more the number. Both are as they come from JSON (`freegeo.files.as_json`).
+    """
+    parts = list(_differences(before, now))
+    more = len(parts) - _SHOWN
+    return "; ".join(parts[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
 
 
 def _ledger(path: Path) -> list[str]:
@@ -207,12 +217,6 @@ def _require_writable(path: Path) -> None:
     existing = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
         raise UserError(f"{path}: the output folder cannot be written to. Choose another one.")
-
-
-def _difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    parts = list(_differences(before, now))
-    more = len(parts) - _SHOWN
-    return "; ".join(parts[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

@@ -29,8 +29,8 @@ def tiny_model(monkeypatch):
 def setup(tmp_path: Path, small_rooms, tiny_model) -> Setup:
     """A run on two rooms with two steps of adaptation."""
     return Setup(
-        data=tmp_path / "data", out=tmp_path / "out", model="tiny-da3", device="cpu", changes={"steps": 2, "batch": 1},
-        scenes={DATASET: ROOMS},
+        data=tmp_path / "data", out=tmp_path / "out", model="tiny-da3", device="cpu", recipe="paper",
+        changes={"steps": 2, "batch": 1}, adapt_per="dataset", adapt_seed=42, scenes={DATASET: ROOMS},
     )  # fmt: skip
 
 

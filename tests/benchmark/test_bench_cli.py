@@ -10,6 +10,11 @@ from freegeo.cli.app import main
 from freegeo.data.datasets import eth3d
 
 BENCH = fixture_path("benchmark", "datasets")
+ADAPTATION_OPTIONS = (
+    ("--lr", "0.5", "recipe.lr"), ("--rank", "2", "recipe.rank"), ("--keep", "0,3", "recipe.keep"),
+    ("--sets", "2", "recipe.sets_per_scene"), ("--teacher-views", "6", "recipe.views"), ("--hold", "1", "recipe.hold"),
+    ("--loss", "weight_kq=0", "recipe.loss.weight_kq"), ("--adapt-seed", "1", "seed"),
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -76,9 +81,10 @@ def test_a_run_prints_and_stores_its_tables_and_a_second_one_does_nothing_again(
     assert "4 tasks, 4 of them finished" in out
     assert (tmp_path / "out" / "results.csv").read_text() == results
 
-    code, _, err = freegeo("predict", "main", *options, "--lr", "0.5")
-    assert code == 2
-    assert "adaptation.recipe.lr" in err
+    for option, value, setting in ADAPTATION_OPTIONS:
+        code, _, err = freegeo("predict", "main", *options, option, value)
+        assert code == 2
+        assert f"adaptation.{setting}: " in err
     assert freegeo("evaluate", "features", *options[:4])[0] in (0, 1)
 
 

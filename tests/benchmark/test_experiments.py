@@ -4,7 +4,7 @@ from freegeo.adaptation.recipe import named
 from freegeo.benchmark.paper.experiments import EXPERIMENTS, ROOMS, chosen, datasets_of
 from freegeo.benchmark.paper.published import Cell, paper_table
 from freegeo.benchmark.paper.tables import NAMES, published_value
-from freegeo.benchmark.paper.variants import VARIANTS, variant
+from freegeo.benchmark.paper.variants import VARIANTS, Variant, variant
 from freegeo.errors import UserError
 from tiny_models import tiny_da3
 
@@ -109,5 +109,10 @@ def test_ablations_change_what_their_names_say():
     rank = variant("rank-64").recipe(base)
     assert rank.rank == rank.alpha == 64
     assert variant("adapted").recipe(base) == base
+    new = Variant(name="new", label="new", changes={"hold": 1.0, "steps": 5, "loss": {"weight_huber": 2.0}}).recipe(
+        base
+    )
+    assert (new.hold, new.steps, new.epochs, new.loss.weight_huber) == (1.0, 5, None, 2.0)
+    assert new.loss.weight_cosine == base.loss.weight_cosine
     with pytest.raises(UserError, match="frozen"):
         variant("thawed")

@@ -17,7 +17,6 @@ from freegeo.benchmark.tasks import (
     TASK_FILE,
     Problem,
     choose_frames,
-    differences,
     finish,
     is_finished,
     run_each,
@@ -77,12 +76,6 @@ def test_neighbours_stand_in_a_row():
     assert np.diff(choose_frames("neighbours", 16, 4, 45)).tolist() == [2] * 3
     with pytest.raises(UserError, match="da3"):
         choose_frames("last", 16, 4, 45)
-
-
-def test_differences_are_named_with_their_place():
-    found = differences({"recipe": {"lr": 1, "rank": 4}, "model": "a"}, {"recipe": {"lr": 2, "rank": 4}, "model": "a"})
-    assert found == ["recipe.lr: 1 there, 2 now"]
-    assert differences({"adaptation": None}, {"adaptation": {"per": "scene"}})
 
 
 def test_a_task_of_other_settings_is_not_taken_for_finished(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 
 from cli.conftest import QUICK
 from freegeo.cli import demo, sources
-from freegeo.files import STATE_FILE
+from freegeo.files import RUN_FILE
 
 SCORE = {"auc05": 0.1, "auc15": 0.2, "auc30": 0.5, "abs_rel": 0.2, "f1_rel5": 0.3}
 
@@ -57,7 +57,7 @@ def test_demo_that_was_stopped_while_scoring_is_not_finished(freegeo, tiny, tmp_
     with monkeypatch.context() as patch:
         patch.setattr(demo, "score_windows", lambda job, scene: (_ for _ in ()).throw(KeyboardInterrupt))
         assert freegeo(*arguments).code == 130
-    assert json.loads((tmp_path / STATE_FILE).read_text())["finished"] is None
+    assert json.loads((tmp_path / RUN_FILE).read_text())["finished"] is None
     outcome = freegeo(*arguments)
     assert outcome.code == 0
     assert "already finished" not in outcome.out

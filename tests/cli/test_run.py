@@ -16,8 +16,7 @@ from cli.conftest import PHOTOS, QUICK
 from freegeo.adaptation import adapt as adapting
 from freegeo.adaptation.adapt import UNFINISHED_FILE
 from freegeo.export import formats
-from freegeo.files import LEDGER_FILE, LOCK_FILE
-from freegeo.files import STATE_FILE as RUN_FILE
+from freegeo.files import LEDGER_FILE, LOCK_FILE, RUN_FILE
 
 ADAPTER_FILES = {"adapter_config.json", "adapter_model.safetensors", "camera_token.safetensors", "freegeo.json"}
 RESULT_FILES = {"reconstruction.json", "prediction.npz", "points.ply", "scene.glb"}

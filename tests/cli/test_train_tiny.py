@@ -1,3 +1,4 @@
+import json
 from functools import partial
 
 import pytest
@@ -26,6 +27,16 @@ def test_training_leaves_weights_and_a_learning_curve_and_goes_on(freegeo, tmp_p
     assert load_model("freegeo-tiny", checkpoint=run / loop.WEIGHTS).spec.name == "freegeo-tiny"
     assert (run / "learning-curve.png").stat().st_size > 20_000
     assert str(run / loop.WEIGHTS) in outcome.out
+    card = tmp_path / "card.json"
+    scored = freegeo(
+        "models", "score", "freegeo-tiny", "--checkpoint", run / loop.WEIGHTS, "--domains", "val-id,val-light",
+        "--rooms", 2, "-o", card,
+    )  # fmt: skip
+    assert scored.code == 0, scored.err
+    assert "| val-light (2) | 8->4 |" in scored.out
+    assert "auc30 0." in scored.out and "not reached" in scored.out
+    assert list(json.loads(card.read_text())["domains"]) == ["val-id", "val-light"]
+    assert "no-such" in freegeo("models", "score", "freegeo-tiny", "--domains", "no-such").sentence()
     again = freegeo("train-tiny", run, "--views", 40)
     assert again.code == 0
     other = freegeo("train-tiny", run, "--views", 40, "--seed", 3)

@@ -6,7 +6,7 @@ import torch
 
 from fixture_tools import fixture_path
 from freegeo.data.colmap_files import read_cameras, read_images
-from freegeo.data.datasets import eth3d, hiroom, scannetpp, sevenscenes
+from freegeo.data.datasets import eth3d, scannetpp, sevenscenes
 from freegeo.data.datasets import registry as datasets
 from freegeo.data.scene import Scene
 from freegeo.errors import FreeGeoError, UserError
@@ -105,7 +105,7 @@ def test_a_depth_file_of_the_wrong_size_is_an_error():
 def test_true_depth_is_metres_and_nothing_where_the_dataset_masks(dataset, name):
     scene = datasets.load_scene(BENCH, dataset, name)
     index = next(i for i, path in enumerate(scene.truth.depth) if path)
-    stored = datasets.PUBLISHED[dataset].read_depth(scene.truth.depth[index], scene.photos[index].size_hw)
+    stored = datasets.get_dataset(dataset).read_depth(scene.truth.depth[index], scene.photos[index].size_hw)
     found = datasets.true_depth(scene, stored.shape)
     assert found.shape == (len(scene), *stored.shape)
     kept = datasets.valid_mask(scene.truth, index, stored.shape) & np.isfinite(stored)
@@ -131,4 +131,4 @@ def test_a_scene_with_views_that_do_not_match_is_refused():
     photos = datasets.load_scene(BENCH, "7scenes", "stairs").photos
     with pytest.raises(UserError, match="views"):
         Scene(name="x", photos=photos, K=torch.eye(3)[None])
-    assert hiroom.PROTOCOL.truth == "points"
+    assert datasets.constants("hiroom").truth == "points"

@@ -84,3 +84,19 @@ def test_one_matrix_turns_a_whole_map():
     expected = torch.einsum("sij,shwj->shwi", matrix, vectors)
     assert torch.allclose(rotation.rotate(matrix, vectors), expected, atol=1e-5)
     assert torch.allclose(rotation.rotate(matrix[0], vectors[0]), expected[0], atol=1e-5)
+
+
+@given(axis=axes, angle=angles, spread=st.floats(0, 1))
+@settings(max_examples=50, deadline=None)
+def test_mean_of_turns_to_both_sides_is_the_middle(axis, angle, spread):
+    middle = rotation.so3_exp(axis / axis.norm() * angle)
+    turns = spread * torch.eye(3, dtype=torch.float64)
+    both = middle @ rotation.so3_exp(torch.cat((turns, -turns)))
+    assert (rotation.mean_rotation(both) - middle).abs().max() < 1e-12
+
+
+def test_mean_is_a_rotation_even_where_the_nearest_orthogonal_matrix_is_a_reflection():
+    half_turns = rotation.so3_exp(math.pi * torch.eye(3, dtype=torch.float64))  # their mean is -I / 3
+    mean = rotation.mean_rotation(half_turns)
+    torch.testing.assert_close(mean @ mean.mT, torch.eye(3, dtype=torch.float64))
+    assert torch.linalg.det(mean) > 0

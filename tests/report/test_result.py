@@ -71,7 +71,7 @@ def test_another_folder_is_moved_onto_the_first(tmp_path):
     assert camera_difference(second.final, first.final)[1].max() > 1
     joined = moved(second, onto=first.final)
     angle, distance = camera_difference(joined.final, first.final)
-    assert angle.max() < 0.1
+    assert angle.max() < 1e-4
     assert distance.max() < 1e-3
     assert np.allclose(joined.final.depth_z, exact.depth_z, rtol=1e-4)
     own = torch.from_numpy(second.final.world_points()[0, 0]).double()

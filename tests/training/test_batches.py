@@ -5,28 +5,28 @@ import torch
 
 from freegeo.geometry import se3
 from freegeo.training.batches import augment, shrink, to_batch, window
-from freegeo.training.config import Stage, TrainConfig
+from freegeo.training.config import Phase, TrainConfig
 from freegeo.training.objective import cell_targets, partners
 
-STAGE = Stage(views=(4,), max_stride=3, reach=10, side=64)
+PHASE = Phase(views=(4,), max_stride=3, reach=10, side=64)
 
 
 def test_windows_are_evenly_spaced_inside_and_go_both_ways():
     generator = torch.Generator().manual_seed(0)
-    seen = [window(10, 4, STAGE, generator) for _ in range(200)]
+    seen = [window(10, 4, PHASE, generator) for _ in range(200)]
     for frames in seen:
         strides = {b - a for a, b in itertools.pairwise(frames)}
         assert len(strides) == 1
         assert min(frames) >= 0 and max(frames) <= 9
     assert {abs(frames[1] - frames[0]) for frames in seen} == {1, 2, 3}
     assert {frames[1] > frames[0] for frames in seen} == {True, False}
-    assert window(8, 8, STAGE, generator) in (list(range(8)), list(range(7, -1, -1)))
+    assert window(8, 8, PHASE, generator) in (list(range(8)), list(range(7, -1, -1)))
 
 
 @pytest.mark.parametrize(("views", "strides"), [(2, {1, 2, 3}), (4, {1, 2, 3}), (6, {1, 2}), (8, {1}), (16, {1})])
 def test_windows_spread_within_their_reach_only(views, strides):
     generator = torch.Generator().manual_seed(0)
-    seen = [window(16, views, STAGE, generator) for _ in range(100)]
+    seen = [window(16, views, PHASE, generator) for _ in range(100)]
     assert {abs(frames[1] - frames[0]) for frames in seen} == strides
 
 
@@ -78,11 +78,11 @@ def test_a_mirrored_sample_is_still_one_world(rooms):
     torch.testing.assert_close(determinant, torch.ones_like(determinant))
 
 
-def test_stages_grow_longer_and_larger():
+def test_phases_grow_longer_and_larger():
     config = TrainConfig()
-    stages = [config.stage(seen) for seen in (0, 30_000, 70_000, 300_000)]
-    assert [max(stage.views) for stage in stages] == sorted(max(stage.views) for stage in stages)
-    assert [stage.side for stage in stages] == [48, 48, 48, 64]
+    phases = [config.phase(seen) for seen in (0, 30_000, 70_000, 300_000)]
+    assert [max(phase.views) for phase in phases] == sorted(max(phase.views) for phase in phases)
+    assert [phase.side for phase in phases] == [48, 48, 48, 64]
 
 
 def test_rate_warms_up_stays_and_cools_down():

@@ -50,7 +50,7 @@ def test_a_killed_run_ends_with_the_same_tensors(tmp_path, small_config, whole_r
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
     killed = subprocess.run([sys.executable, "-c", KILLED_RUN, str(tmp_path / "killed")], env=environment, check=False)
     assert killed.returncode == -signal.SIGKILL
-    saved = torch.load(tmp_path / "killed" / state.STATE, weights_only=True)
+    saved = torch.load(tmp_path / "killed" / state.NEWEST_FILE, weights_only=True)
     assert 0 < saved["counters"][0] <= 4
     weights = train(small_config, tmp_path / "killed")
     expected, found = tensors(whole_run), tensors(weights)
@@ -61,7 +61,7 @@ def test_a_killed_run_ends_with_the_same_tensors(tmp_path, small_config, whole_r
 def test_a_larger_budget_goes_on_from_the_plateau(tmp_path, small_config, whole_run):
     folder = tmp_path / "larger"
     shutil.copytree(whole_run.parent, folder)
-    plateau = torch.load(folder / state.PLATEAU, weights_only=True)
+    plateau = torch.load(folder / state.PLATEAU_FILE, weights_only=True)
     assert 30 <= plateau["counters"][1] < 40
     steps = []
     larger = replace(small_config, views=60)
@@ -72,7 +72,7 @@ def test_a_larger_budget_goes_on_from_the_plateau(tmp_path, small_config, whole_
 
 
 def test_a_run_continues_another_one_with_rooms_and_rates_of_its_own(tmp_path, small_config, whole_run):
-    before = torch.load(whole_run.parent / state.STATE, weights_only=True)["counters"].tolist()
+    before = torch.load(whole_run.parent / state.NEWEST_FILE, weights_only=True)["counters"].tolist()
     config = replace(small_config, views=60, first_room=6, peak=0.25, cooldown=1.0)
     steps = []
     folder = tmp_path / "next"
@@ -125,13 +125,13 @@ def test_a_leg_stops_in_time_and_is_resumed(tmp_path, small_config):
     seen = []
     train(small_config, tmp_path / "legs", minutes=0.0, progress=lambda now: seen.append(now.step))
     assert not seen
-    assert (tmp_path / "legs" / state.STATE).is_file()
+    assert (tmp_path / "legs" / state.NEWEST_FILE).is_file()
 
 
 def test_two_workers_learn_on_the_same_weights(tmp_path, small_config):
     by_first_process = []
     weights = train(small_config, tmp_path / "two", workers=2, progress=lambda now: by_first_process.append(now.seen))
-    saved = torch.load(tmp_path / "two" / state.STATE, weights_only=True)
+    saved = torch.load(tmp_path / "two" / state.NEWEST_FILE, weights_only=True)
     assert saved["counters"][1] >= 40
     assert all(torch.isfinite(value).all() for value in tensors(weights).values())
     assert read_json(tmp_path / "two" / loop.CONFIG)["views"] == 40

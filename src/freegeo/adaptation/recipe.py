@@ -312,7 +312,7 @@ def named(name: str, spec: ModelSpec, dataset: str | None = None) -> Recipe:
     if name == "paper":
         return paper(spec, dataset)
     if name in (RELEASED_DA3.name, RELEASED_VGGT.name):
-        return released(name, dataset)
+        return released(name, dataset, spec)
     *others, last = get_args(RecipeName)
     raise UserError(f"unknown recipe '{name}'. Known are {', '.join(others)} and {last}.")
 
@@ -330,25 +330,24 @@ def scene(spec: ModelSpec) -> Recipe:
 def paper(spec: ModelSpec, dataset: str | None) -> Recipe:
     """Return the paper's settings of a dataset; a model without published settings keeps its own rate and rank."""
     own = spec.adaptation
-    if dataset == "procedural":
-        # Generated rooms are no published dataset; 150 steps of batch 4 over 10 to 100 rooms was measured to suffice.
-        row = DatasetRow(4, 4, 3, own.scene_lr, 1e-6)
-    else:
-        row = _row(PAPER_DATASETS, dataset, PAPER.name)
+    row = _row(PAPER_DATASETS, dataset, PAPER.name, spec)
     return PAPER.changed(
         **row._asdict(), rank=None if own.published else own.rank, neighbours=own.neighbours,
         loss={"temperature": own.temperature},
     )  # fmt: skip
 
 
-def released(name: str, dataset: str | None) -> Recipe:
+def released(name: str, dataset: str | None, spec: ModelSpec | None = None) -> Recipe:
     """Return what the authors' runner of a model family computes, per dataset."""
     is_da3 = name == RELEASED_DA3.name
     recipe, rows = (RELEASED_DA3, RELEASED_DA3_DATASETS) if is_da3 else (RELEASED_VGGT, RELEASED_VGGT_DATASETS)
-    return recipe.changed(**_row(rows, dataset, name)._asdict())
+    return recipe.changed(**_row(rows, dataset, name, spec)._asdict())
 
 
-def _row(rows: Mapping[str, DatasetRow], dataset: str | None, name: str) -> DatasetRow:
+def _row(rows: Mapping[str, DatasetRow], dataset: str | None, name: str, spec: ModelSpec | None) -> DatasetRow:
+    if dataset == "procedural" and spec is not None:
+        # Generated rooms are no published dataset; 150 steps of batch 4 over 10 to 100 rooms was measured to suffice.
+        return DatasetRow(4, 4, 3, spec.adaptation.scene_lr, 1e-6)
     if dataset is None or dataset not in rows:
         known = ", ".join(rows)
         raise UserError(f"recipe '{name}' has settings per dataset: choose --dataset from {known}, or --recipe scene.")

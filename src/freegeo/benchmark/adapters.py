@@ -27,10 +27,10 @@ from freegeo.adaptation.adapter_files import load_adapter, save_adapter
 from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
 from freegeo.adaptation.samples import SceneImages
 from freegeo.adaptation.views import schedule
-from freegeo.benchmark.tasks import DAMAGED, Problem, plain, reason_of
+from freegeo.benchmark.tasks import DAMAGED, Problem, reason_of
 from freegeo.data.datasets.registry import load_scene
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import read_json, write_json
+from freegeo.files import as_json, read_json, write_json
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
 
@@ -52,7 +52,7 @@ class AdapterJob:
 
     def configuration(self) -> dict[str, Any]:
         """Everything that decides the adapter."""
-        return plain({
+        return as_json({
             "dataset": self.dataset, "scenes": self.scenes, "recipe": asdict(self.recipe), "seed": self.seed,
             **self.base,
         })  # fmt: skip
@@ -97,8 +97,8 @@ def train(
     write_json(folder / CONFIGURATION, job.configuration())
 
     def keep(epoch: int, adapter: Adapter) -> None:
-        page = {"epoch": epoch, "scenes": [scene.name for scene in scenes], "configuration": job.configuration()}
-        save_adapter(adapter, epoch_folder(job, out, epoch), page)
+        metadata = {"epoch": epoch, "scenes": [scene.name for scene in scenes], "configuration": job.configuration()}
+        save_adapter(adapter, epoch_folder(job, out, epoch), metadata)
 
     reset_peak_memory(compute.device)
     result = adapt(

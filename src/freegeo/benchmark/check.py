@@ -8,12 +8,9 @@ from pathlib import Path
 
 from freegeo.benchmark.tasks import DAMAGED, reason_of
 from freegeo.data.datasets import registry as datasets
-from freegeo.data.procedural.splits import PREFIX
-from freegeo.errors import UserError
+from freegeo.data.datasets.base import Dataset
 
 HUB_DATASET = "depth-anything/DA3-BENCH"
-ARCHIVE_GB = {"eth3d": 14.1, "7scenes": 3.3, "scannetpp": 10.1, "hiroom": 0.7}
-"""Sizes of the archives on the hub."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,28 +32,34 @@ class Finding:
         return not self.problems
 
 
-def check_data(data: Path, names: Sequence[str] = tuple(datasets.PUBLISHED)) -> list[Finding]:
+def check_data(data: Path, names: Sequence[str] | None = None) -> list[Finding]:
     """Look at each dataset: scene folders, frames, ground truth. Images are not decoded.
 
-    UserError for a dataset that does not exist.
+    Args:
+        data: folder of the unpacked datasets.
+        names: datasets to look at; None: all that are not generated.
+
+    Raises:
+        UserError: there is no such dataset.
     """
+    if names is None:
+        names = [dataset.name for dataset in datasets.DATASETS.values() if not dataset.generated]
     return [check_dataset(Path(data), name) for name in names]
 
 
 def check_dataset(data: Path, name: str) -> Finding:
-    """Look at one dataset."""
-    if name.startswith(PREFIX) and name in datasets.DATASETS:
+    """Look at one dataset; UserError when there is none of this name."""
+    dataset = datasets.get_dataset(name)
+    if dataset.generated:
         return Finding(dataset=name, scenes=0, wanted=0, problems=(), how_to_get="rendered when it is used")
-    if name not in datasets.PUBLISHED:
-        raise UserError(f"There is no dataset {name!r}; known are {', '.join(datasets.DATASETS)}.")
-    how = download_command(data, name)
+    how = how_to_get(data, dataset)
     if not (data / name).is_dir():
         return Finding(dataset=name, scenes=0, wanted=0, problems=(f"{data / name}: no such folder",), how_to_get=how)
     try:
         scenes = datasets.scene_names(data, name)
     except DAMAGED as error:
         return Finding(dataset=name, scenes=0, wanted=0, problems=(reason_of(error),), how_to_get=how)
-    problems = {scene: _scene_problems(data, name, scene) for scene in scenes}
+    problems = {scene: _scene_problems(data, dataset, scene) for scene in scenes}
     return Finding(
         dataset=name,
         scenes=sum(not found for found in problems.values()),
@@ -66,27 +69,29 @@ def check_dataset(data: Path, name: str) -> Finding:
     )
 
 
-def download_command(data: Path, name: str) -> str:
-    """Commands that fetch and unpack a published dataset."""
+def how_to_get(data: Path, dataset: Dataset) -> str:
+    """Commands that fetch and unpack a dataset; for one that is not on the hub, where its scenes are looked for."""
+    if dataset.archive_gb is None:
+        return f"put its scenes into {data / dataset.name}"
     return (
-        f"hf download {HUB_DATASET} {name}.zip --repo-type dataset --local-dir {data} && "
-        f"unzip -q {data / name}.zip -d {data}   # {ARCHIVE_GB[name]} GB"
+        f"hf download {HUB_DATASET} {dataset.name}.zip --repo-type dataset --local-dir {data} && "
+        f"unzip -q {data / dataset.name}.zip -d {data}   # {dataset.archive_gb} GB"
     )
 
 
-def _scene_problems(data: Path, dataset: str, scene: str) -> list[str]:
+def _scene_problems(data: Path, dataset: Dataset, scene: str) -> list[str]:
     try:
-        loaded = datasets.load_scene(data, dataset, scene)
+        loaded = datasets.load_scene(data, dataset.name, scene)
     except DAMAGED as error:
         return [reason_of(error)]
     truth = loaded.truth
-    assert truth is not None
+    if truth is None:
+        return ["no ground truth, so it cannot be scored"]
     problems = []
     if not truth.surface.is_file():
         problems.append(f"{truth.surface}: no such file (ground truth)")
     without = sum(path is None for path in truth.depth)
-    # ETH3D carries depth only where a laser scan was rendered; elsewhere it is part of every frame.
-    if without and dataset != "eth3d":
+    if without and dataset.depth_of_every_frame and dataset.read_depth is not None:
         problems.append(f"{without} of {len(loaded)} frames have no ground-truth depth, so they are fused unmasked")
     if len(loaded) < 3:
         problems.append(f"{len(loaded)} frames: fewer than 3 cannot be aligned")

@@ -16,8 +16,8 @@ from freegeo.adaptation.samples import SceneImages
 from freegeo.benchmark.paper.variants import variant
 from freegeo.benchmark.predict import Predictor
 from freegeo.benchmark.tasks import DAMAGED, SAMPLE, Task
-from freegeo.data.datasets.base import Protocol
-from freegeo.data.datasets.registry import load_scene, protocol
+from freegeo.data.datasets.base import DatasetConstants
+from freegeo.data.datasets.registry import constants, load_scene
 from freegeo.fusion.mesh import sample_surface
 from freegeo.fusion.tsdf import TsdfVolume
 from freegeo.geometry.camera import K_from_fov
@@ -100,7 +100,7 @@ class ScoringCost:
 
 
 def estimate_scoring(data: Path, tasks: Sequence[Task], *, device: torch.device | str = "cpu") -> list[ScoringCost]:
-    """Measure fusion and scoring of a slanted wall at each dataset's sizes; a room has more surface than that.
+    """Measure fusion and scoring of a slanted wall at each dataset's sizes; a real scene has more surface than that.
 
     A dataset whose first scene cannot be read is left out: the run itself will say why.
     """
@@ -113,8 +113,8 @@ def estimate_scoring(data: Path, tasks: Sequence[Task], *, device: torch.device 
             scene = load_scene(data, dataset, own[0].scene)
         except DAMAGED:
             continue
-        rules = protocol(dataset)
-        frame, surface = _seconds_of_fusion(rules, rules.fusion_hw or scene.photos[0].size_hw, device)
+        fixed = constants(dataset)
+        frame, surface = _seconds_of_fusion(fixed, fixed.fusion_hw or scene.photos[0].size_hw, device)
         costs.append(
             ScoringCost(
                 dataset=dataset, frames=sum(task.views for task in own), surfaces=len(own), seconds_of_frame=frame,
@@ -124,16 +124,18 @@ def estimate_scoring(data: Path, tasks: Sequence[Task], *, device: torch.device 
     return costs
 
 
-def _seconds_of_fusion(rules: Protocol, size_hw: tuple[int, int], device: torch.device | str) -> tuple[float, float]:
+def _seconds_of_fusion(
+    fixed: DatasetConstants, size_hw: tuple[int, int], device: torch.device | str
+) -> tuple[float, float]:
     depth_z = torch.linspace(*WALL_DEPTH_M, size_hw[1]).expand(size_hw)
     K = K_from_fov(torch.tensor(0.8), torch.tensor(1.0), size_hw)
-    volume = TsdfVolume(voxel=rules.voxel, truncation=rules.truncation, device=device)
+    volume = TsdfVolume(voxel=fixed.voxel, truncation=fixed.truncation, device=device)
     started = time.perf_counter()
     for _ in range(MEASURED_FRAMES):
-        volume.integrate(depth_z, K, torch.eye(4), depth_limit=rules.depth_limit)
+        volume.integrate(depth_z, K, torch.eye(4), depth_limit=fixed.depth_limit)
     fused = time.perf_counter()
-    points = sample_surface(volume.extract_mesh(), rules.samples, seed=0)
-    ReferenceCloud(points, down_sample=rules.down_sample).score(points, threshold=rules.threshold)
+    points = sample_surface(volume.extract_mesh(), fixed.samples, seed=0)
+    ReferenceCloud(points, down_sample=fixed.down_sample).score(points, threshold=fixed.threshold)
     return (fused - started) / MEASURED_FRAMES, time.perf_counter() - fused
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from freegeo.data.datasets.base import Protocol, SceneTruth
-from freegeo.data.datasets.registry import protocol, valid_mask
-from freegeo.data.scene import Scene
+from freegeo.data.datasets.base import DatasetConstants
+from freegeo.data.datasets.registry import constants, valid_mask
+from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import UserError
 from freegeo.geometry.camera import resize_K
 from freegeo.geometry.resample import resize_nearest
@@ -40,18 +40,18 @@ def fusion_frames(scene: Scene, prediction: Prediction, *, posed: bool = False) 
     Raises:
         UserError: views do not match or something is missing. FreeGeoError: the cameras cannot be aligned.
 
-    Source: benchmark protocol, section 6.
+    Source: docs/benchmark.md, "Fusion and scoring".
     """
     truth, known_T, known_K = require_truth(scene)
-    rules = protocol(truth.dataset)
+    fixed = constants(truth.dataset)
     depth, T, K = require_prediction(scene, prediction)
     aligned = align_cameras(known_T, T.double())
     for index, photo in enumerate(scene.photos):
-        size_hw = rules.fusion_hw or photo.size_hw
-        resized = _resized(depth[index].float(), truth.camera_hw[index], size_hw, rules)
+        size_hw = fixed.fusion_hw or photo.size_hw
+        resized = _resized(depth[index].float(), truth.camera_hw[index], size_hw, fixed)
         metric = _masked(resized, valid_mask(truth, index, size_hw)) * float(aligned.sim3.s)
         if posed:
-            camera = _posed_K(known_K[index].float(), truth, index, size_hw, rules)
+            camera = _posed_K(known_K[index].float(), truth, index, size_hw, fixed)
             yield FusionFrame(metric, camera, known_T[index])
         else:
             camera = resize_K(K[index].float(), (depth.shape[-2], depth.shape[-1]), size_hw)
@@ -79,8 +79,8 @@ def require_prediction(scene: Scene, prediction: Prediction) -> tuple[Tensor, Te
     return depth.cpu(), T.cpu(), K.cpu()
 
 
-def _resized(depth: Tensor, camera_hw: tuple[int, int], size_hw: tuple[int, int], rules: Protocol) -> Tensor:
-    if rules.fusion_hw is None:
+def _resized(depth: Tensor, camera_hw: tuple[int, int], size_hw: tuple[int, int], fixed: DatasetConstants) -> Tensor:
+    if fixed.fusion_hw is None:
         return resize_nearest(depth, size_hw)
     import cv2
 
@@ -97,9 +97,9 @@ def _masked(depth: Tensor, mask: np.ndarray | None) -> Tensor:
     return depth * (torch.from_numpy(mask) & depth.isfinite())
 
 
-def _posed_K(K: Tensor, truth: SceneTruth, index: int, size_hw: tuple[int, int], rules: Protocol) -> Tensor:
-    if rules.fusion_hw is None:
+def _posed_K(K: Tensor, truth: SceneTruth, index: int, size_hw: tuple[int, int], fixed: DatasetConstants) -> Tensor:
+    if fixed.fusion_hw is None:
         return K
     shifted = K.clone()
-    shifted[:2, 2] += rules.posed_centre_shift
+    shifted[:2, 2] += fixed.posed_centre_shift
     return resize_K(shifted, truth.camera_hw[index], size_hw)

@@ -17,7 +17,7 @@ from torch import Tensor
 from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapt import Progress
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.recipe import PAPER_SEED, Recipe
+from freegeo.adaptation.recipe import Recipe
 from freegeo.benchmark.adapters import AdapterJob, peak_memory_gb, reset_peak_memory, train, use
 from freegeo.benchmark.frames import require_truth
 from freegeo.benchmark.paper.variants import Variant, variant
@@ -34,8 +34,7 @@ from freegeo.benchmark.tasks import (
     run_each,
     unique,
 )
-from freegeo.data.datasets.registry import load_scene, scene_names
-from freegeo.data.procedural.splits import PREFIX
+from freegeo.data.datasets.registry import get_dataset, load_scene, scene_names
 from freegeo.data.scene import Scene
 from freegeo.errors import UserError
 from freegeo.files import write_json
@@ -47,6 +46,8 @@ from freegeo.models.precision import Compute, Precision
 from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
 
 AdaptPer = Literal["dataset", "scene"]
+DEFAULT_ROW = "procedural"
+"""Settings of adaptation of a dataset for which none were published."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,11 +61,11 @@ class Setup:
     checkpoint: Path | None = None
     device: str | None = None
     precision: Precision | None = None
-    recipe: str = "paper"
+    recipe: str
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the recipe that are replaced, as in `Recipe.changed`."""
-    adapt_per: AdaptPer = "dataset"
-    adapt_seed: int = PAPER_SEED
+    adapt_per: AdaptPer
+    adapt_seed: int
     epoch: int | None = None
     """Which epoch's adapter predicts; None: the last."""
     given_cameras: bool = False
@@ -107,9 +108,12 @@ class Predictor:
         )
 
     def recipe(self, dataset: str) -> Recipe:
-        """The recipe of a dataset with the changes of the run."""
-        family = "procedural" if dataset.startswith(PREFIX) else dataset
-        return recipes.named(self.setup.recipe, self.model.spec, family).changed(**self.setup.changes)
+        """The recipe of a dataset with the changes of the run.
+
+        A dataset without published settings takes those of generated rooms (docs/benchmark.md, "Adding a dataset").
+        """
+        row = get_dataset(dataset).recipe_row or DEFAULT_ROW
+        return recipes.named(self.setup.recipe, self.model.spec, row).changed(**self.setup.changes)
 
     def unfinished(self, tasks: Sequence[Task]) -> list[Task]:
         """The tasks that still have to be predicted; UserError when one was made with other settings."""

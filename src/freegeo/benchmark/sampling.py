@@ -13,7 +13,6 @@ from freegeo.errors import UserError
 
 PAPER_BUDGETS = (4, 8, 16, 32, 64, 100)
 PAPER_SEEDS = (43, 44, 45)
-MULTIVIEW_BUDGETS = (8, 16, 32)
 _SUBSET_SHARE = 0.1
 
 
@@ -28,7 +27,7 @@ def standard_frames(num_frames: int, budget: int, seed: int) -> list[int]:
         budget: frames wanted; 0 or less asks for all.
         seed: any integer.
 
-    Source: benchmark protocol, section 2, standard rule.
+    Source: docs/benchmark.md, "Frame rules".
     """
     if budget <= 0 or num_frames <= budget:
         return list(range(num_frames))
@@ -41,7 +40,7 @@ def every_second_frame(num_frames: int, budget: int, keep: int, seed: int) -> li
     These are exactly the frames the student sees while adapting. A scene of at most `budget` but more than `keep`
     frames is thinned the same way, which can leave fewer than `keep`; a scene of at most `keep` frames is used whole.
 
-    Source: benchmark protocol, section 2, VGGT with `eval_frames`.
+    Source: docs/benchmark.md, "Frame rules".
     """
     if keep < 1:
         raise UserError(f"At least one frame must be kept, not {keep}.")
@@ -54,7 +53,7 @@ def multiview_frames(dataset: str, scene: str, num_frames: int, budget: int, see
 
     The indices count the frames sorted by image path, not in loader order.
 
-    Source: benchmark protocol, section 2, multi-view script.
+    Source: docs/benchmark.md, "Frame rules", multi-view script.
     """
     if num_frames <= budget:
         return list(range(num_frames))
@@ -65,7 +64,7 @@ def multiview_frames(dataset: str, scene: str, num_frames: int, budget: int, see
 def window_frames(num_frames: int, budget: int, seed: int) -> list[int]:
     """A window of `budget` neighbours in an evenly thinned scene (a tenth of it); the seed picks the window.
 
-    Source: benchmark protocol, section 2, VGGT `subset_sampling` (an option the paper does not use).
+    Source: docs/benchmark.md, "Frame rules", windows (an option of VGGT's evaluator that the paper does not use).
     """
     if budget <= 0 or num_frames <= budget:
         return list(range(num_frames))
@@ -83,7 +82,7 @@ def window_frames(num_frames: int, budget: int, seed: int) -> list[int]:
 def experiment_frames(num_frames: int, budget: int = 8, seed: int = 42) -> list[int]:
     """The 8 frames behind the "8 -> 4" comparison; its 4 views are positions 0, 2, 4, 6.
 
-    Source: benchmark protocol, section 2, experiment runner (NumPy's legacy generator, choice without replacement).
+    NumPy's legacy generator draws them without replacement. Source: docs/benchmark.md, "Frame rules".
     """
     if num_frames <= budget:
         return list(range(num_frames))

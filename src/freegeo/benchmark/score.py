@@ -16,17 +16,17 @@ from typing import Any
 import torch
 
 from freegeo.benchmark.adapters import FINISHED, FOLDER
-from freegeo.benchmark.evaluate import (
+from freegeo.benchmark.frames import require_prediction
+from freegeo.benchmark.paper.variants import variant
+from freegeo.benchmark.predict import problem_of
+from freegeo.benchmark.results import Row, rows_of, write_results
+from freegeo.benchmark.scene_score import (
     GROUND_TRUTH,
     SceneReference,
     load_reference,
     score_scene_poses,
     score_scene_surface,
 )
-from freegeo.benchmark.frames import require_prediction
-from freegeo.benchmark.paper.variants import variant
-from freegeo.benchmark.predict import problem_of
-from freegeo.benchmark.results import Row, rows_of, write_results
 from freegeo.benchmark.stored import Stored, read_stored
 from freegeo.benchmark.tasks import (
     MEASURED_FILE,
@@ -34,7 +34,6 @@ from freegeo.benchmark.tasks import (
     Problem,
     Task,
     by_scene,
-    differences,
     reason_of,
     run_each,
     stored_tasks,
@@ -46,6 +45,7 @@ from freegeo.files import read_json, write_json
 from freegeo.metrics.cloud import f1_rel5
 from freegeo.metrics.depth import score_depth
 from freegeo.metrics.scene import at_size
+from freegeo.run_folder import difference
 
 EMPTY_SURFACE = "the fusion gave no surface: precision, recall and F1 are 0, distances do not exist"
 _SAME_IN_ALL = ("model", "checkpoint", "precision", "given_cameras")
@@ -115,10 +115,10 @@ def require_same_settings(stored: Mapping[Task, Mapping[str, Any]]) -> None:
 
 
 def _require_equal(one: tuple[Task, Mapping[str, Any]], other: tuple[Task, Mapping[str, Any]]) -> None:
-    unequal = differences(one[1], other[1])
+    unequal = difference(one[1], other[1])
     if unequal:
         raise UserError(
-            f"predictions of different settings cannot share a table: {'; '.join(unequal)} ({one[0]}; {other[0]}). "
+            f"predictions of different settings cannot share a table: {unequal} ({one[0]}; {other[0]}). "
             "Predict one of them again with --overwrite, or use another output folder."
         )
 

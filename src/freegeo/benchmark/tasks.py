@@ -12,7 +12,6 @@ A task depends on no other one, so a run may be stopped anywhere, continued, or 
 
 from __future__ import annotations
 
-import json
 import logging
 import struct
 import zlib
@@ -25,8 +24,9 @@ import torch
 
 from freegeo.benchmark import sampling
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import read_json, write_json
+from freegeo.files import as_json, read_json, write_json
 from freegeo.models.api import AdaptationDefaults
+from freegeo.run_folder import difference
 
 logger = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ def choose_frames(rule: FrameRule, num_frames: int, views: int, seed: int) -> li
     likewise. `neighbours` (ours): 8 frames in a row from a seeded start,
     fewer than 8 are every second of them; more than 8 are a longer row.
 
-    Source: benchmark protocol, section 2.
+    Source: docs/benchmark.md, "Frame rules".
     """
     if rule == "da3":
         return sampling.standard_frames(num_frames, views, seed)
@@ -116,23 +116,6 @@ def family_rule(own: AdaptationDefaults) -> FrameRule:
     return "vggt" if own.published == "vggt" else "da3"
 
 
-def plain(value: Any) -> Any:
-    """The value as it comes back from a JSON file: tuples become lists, keys text."""
-    return json.loads(json.dumps(value))
-
-
-def differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Names of the settings in which two configurations differ, dotted, with both values."""
-    found = []
-    for name in sorted(set(before) | set(now)):
-        old, new = before.get(name), now.get(name)
-        if isinstance(old, Mapping) and isinstance(new, Mapping):
-            found += differences(old, new, f"{prefix}{name}.")
-        elif old != new:
-            found.append(f"{prefix}{name}: {_short(old)} there, {_short(new)} now")
-    return found
-
-
 def is_finished(task: Task, out: Path, configuration: Mapping[str, Any], *, overwrite: bool = False) -> bool:
     """Whether the task's prediction is there, made with this configuration.
 
@@ -141,10 +124,10 @@ def is_finished(task: Task, out: Path, configuration: Mapping[str, Any], *, over
     path = task.folder(out) / TASK_FILE
     if not path.is_file():
         return False
-    unequal = differences(read_json(path)["configuration"], plain(configuration))
+    unequal = difference(read_json(path)["configuration"], as_json(configuration))
     if unequal and not overwrite:
         raise UserError(
-            f"{path.parent}: was predicted with other settings ({'; '.join(unequal)}). Choose another output folder, "
+            f"{path.parent}: was predicted with other settings ({unequal}). Choose another output folder, "
             "or replace it with --overwrite."
         )
     return not unequal
@@ -154,7 +137,7 @@ def finish(task: Task, out: Path, configuration: Mapping[str, Any], **facts: Any
     """Mark a task as done; older scores of it are dropped."""
     folder = task.folder(out)
     (folder / SCORES_FILE).unlink(missing_ok=True)
-    write_json(folder / TASK_FILE, {"task": asdict(task), "configuration": plain(configuration), **facts})
+    write_json(folder / TASK_FILE, {"task": asdict(task), "configuration": as_json(configuration), **facts})
 
 
 def stored_tasks(out: Path) -> list[tuple[Task, dict[str, Any]]]:
@@ -201,8 +184,3 @@ def by_scene(tasks: Iterable[Task]) -> dict[tuple[str, str], list[Task]]:
 def unique(items: Sequence[Item]) -> list[Item]:
     """The items without repeats, in their first order."""
     return list(dict.fromkeys(items))
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -11,7 +11,9 @@ from cyclopts import App, Parameter
 
 from freegeo.adaptation.recipe import PAPER_SEED, RecipeName
 from freegeo.cli import console
+from freegeo.cli.options import ModelOptions, RecipeOptions, use_few_threads
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.models.catalog import EMBEDDED_MODEL
 
 if TYPE_CHECKING:
     from freegeo.benchmark.paper.experiments import Experiment
@@ -41,7 +43,7 @@ class BenchOptions:
     data: Path = DATA
     """Folder of the unpacked datasets; generated rooms are rendered into it."""
     datasets: str = "procedural"
-    """Separated by commas: eth3d, 7scenes, scannetpp, hiroom, procedural (its five splits), procedural-light, ..."""
+    """Separated by commas: eth3d, 7scenes, scannetpp, hiroom, procedural (the reported rooms), procedural-light, ..."""
     scenes: int | None = None
     """Only the first so many scenes of every dataset."""
     views: str | None = None
@@ -56,38 +58,48 @@ class BenchOptions:
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class BenchModel:
-    """Which model is scored, and how it is adapted."""
+class BenchModel(ModelOptions):
+    """Which model is scored."""
 
-    model: str = "freegeo-tiny"
+    model: str = EMBEDDED_MODEL
     """Catalog name (`freegeo models`) or a plug-in's."""
-    checkpoint: Path | None = None
-    """Local weight file or folder, instead of the download."""
-    device: str | None = None
-    """cpu, cuda, cuda:N or mps; default: the best at hand."""
-    precision: Literal["fp32", "bf16", "fp16"] | None = None
-    """Arithmetic of the transformer; default: bf16 on CUDA, else fp32."""
+    seed: Annotated[int, Parameter(name="--adapt-seed")] = PAPER_SEED
+    """Seed of the adaptation; the frames have seeds of their own (--seeds)."""
+    reference: Annotated[None, Parameter(parse=False)] = None
+    """Not an option here: the first view is always the reference."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class BenchRecipe(RecipeOptions):
+    """How the model is adapted; settings left out are those of the recipe for each dataset."""
+
     recipe: RecipeName = "paper"
-    """Named settings of adaptation."""
-    steps: int | None = None
-    """Optimiser steps instead of the recipe's length."""
-    epochs: int | None = None
-    """Passes over all view sets instead of the recipe's length."""
-    lr: float | None = None
-    """Peak learning rate."""
-    hold: float | None = None
-    """Weight of keeping what the model says with all views as it is; default: 0, as in the paper."""
+    """Named settings; a dataset for which none were published takes those of generated rooms."""
+    dataset: Annotated[None, Parameter(parse=False)] = None
+    """Not an option here: every dataset has its own settings."""
+    views: Annotated[int | None, Parameter(name="--teacher-views")] = None
+    """Views the teacher sees while adapting (8); --views are those that are scored."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class PredictOptions:
+    """How the first stage is carried out."""
+
     adapt_per: Literal["dataset", "scene"] = "dataset"
     """One adapter for all scenes of a dataset, or one for each."""
-    adapt_seed: int = PAPER_SEED
-    """Seed of the adaptation."""
     epoch: int | None = None
     """Epoch whose adapter is used, counted from 0; default: the last."""
     given_cameras: bool = False
     """Give the model the true cameras and fuse its depth with them (recon_posed)."""
+    overwrite: bool = False
+    """Replace predictions that were made with other settings."""
+    cluster: bool = False
+    """Spread the tasks over a ray cluster (extra `cluster`)."""
 
 
-DEFAULT_BENCH, DEFAULT_MODEL = BenchOptions(), BenchModel()
+BENCH, MODEL, RECIPE, PREDICT = BenchOptions(), BenchModel(), BenchRecipe(), PredictOptions()
 
 
 @app.command(name="list")
@@ -102,7 +114,7 @@ def list_experiments() -> None:
 
 
 @app.command
-def check(data: Path = DATA, *, datasets: str = "eth3d,7scenes,scannetpp,hiroom") -> None:
+def check(data: Path = DATA, *, datasets: str | None = None) -> None:
     """Say what is missing in a data folder and how to get it.
 
     Parameters
@@ -110,11 +122,11 @@ def check(data: Path = DATA, *, datasets: str = "eth3d,7scenes,scannetpp,hiroom"
     data
         Folder of the unpacked datasets.
     datasets
-        Datasets to look at, separated by commas.
+        Datasets to look at, separated by commas; default: all that are not generated.
     """
     from freegeo.benchmark.check import check_data
 
-    findings = check_data(data, _split(datasets))
+    findings = check_data(data, None if datasets is None else _split(datasets))
     for finding in findings:
         console.say(f"{finding.dataset}: {finding.scenes} of {finding.wanted or '?'} scenes complete")
         for problem in finding.problems[:SHOWN_PROBLEMS]:
@@ -131,11 +143,11 @@ def check(data: Path = DATA, *, datasets: str = "eth3d,7scenes,scannetpp,hiroom"
 @app.command
 def predict(
     *experiments: str,
-    bench: BenchOptions = DEFAULT_BENCH,
-    model: BenchModel = DEFAULT_MODEL,
-    overwrite: bool = False,
+    bench: BenchOptions = BENCH,
+    model: BenchModel = MODEL,
+    recipe: BenchRecipe = RECIPE,
+    options: PredictOptions = PREDICT,
     estimate_only: bool = False,
-    cluster: bool = False,
 ) -> None:
     """First stage: predict everything the experiments need; a stopped run continues.
 
@@ -143,23 +155,17 @@ def predict(
     ----------
     experiments
         Names (`freegeo bench list`), or all.
-    overwrite
-        Replace predictions that were made with other settings.
     estimate_only
         Only say what it would cost.
-    cluster
-        Spread the tasks over a ray cluster (extra `cluster`).
     """
-    predictor, tasks = _prepare(experiments, bench, model, overwrite)
-    problems = _predict(predictor, tasks, bench, estimate_only=estimate_only, cluster=cluster)
+    predictor, tasks = _prepare(experiments, bench, model, recipe, options)
+    problems = _predict(predictor, tasks, bench, estimate_only=estimate_only, cluster=options.cluster)
     _say(problems)
     _require_none(problems, bench.output)
 
 
 @app.command
-def evaluate(
-    *experiments: str, bench: BenchOptions = DEFAULT_BENCH, device: str | None = None, figures: bool = False
-) -> None:
+def evaluate(*experiments: str, bench: BenchOptions = BENCH, device: str | None = None, figures: bool = False) -> None:
     """Second stage: score the stored predictions of a folder and print the tables; needs no model.
 
     Parameters
@@ -182,10 +188,10 @@ def evaluate(
 @app.command
 def run(
     *experiments: str,
-    bench: BenchOptions = DEFAULT_BENCH,
-    model: BenchModel = DEFAULT_MODEL,
-    overwrite: bool = False,
-    cluster: bool = False,
+    bench: BenchOptions = BENCH,
+    model: BenchModel = MODEL,
+    recipe: BenchRecipe = RECIPE,
+    options: PredictOptions = PREDICT,
     figures: bool = False,
 ) -> None:
     """Both stages: predict, evaluate, print the tables.
@@ -194,17 +200,13 @@ def run(
     ----------
     experiments
         Names (`freegeo bench list`), or all.
-    overwrite
-        Replace predictions that were made with other settings.
-    cluster
-        Spread the predictions over a ray cluster (extra `cluster`).
     figures
         Draw the figures too.
     """
     from freegeo.benchmark.tasks import stored_tasks
 
-    predictor, tasks = _prepare(experiments, bench, model, overwrite)
-    problems = _predict(predictor, tasks, bench, cluster=cluster)
+    predictor, tasks = _prepare(experiments, bench, model, recipe, options)
+    problems = _predict(predictor, tasks, bench, cluster=options.cluster)
     # What could not be predicted is known already; it shall not be reported twice.
     stored = {task for task, _ in stored_tasks(bench.output)}
     wanted = [task for task in tasks if task in stored]
@@ -221,13 +223,12 @@ def run(
 
 
 def _prepare(
-    experiments: Sequence[str], bench: BenchOptions, model: BenchModel, overwrite: bool
+    experiments: Sequence[str], bench: BenchOptions, model: BenchModel, recipe: BenchRecipe, options: PredictOptions
 ) -> tuple[Predictor, list[Task]]:
     """Return the predictor and the tasks of a run."""
     from freegeo.benchmark.paper.experiments import chosen, datasets_of
     from freegeo.benchmark.predict import Predictor, Setup, listed_scenes
     from freegeo.benchmark.tasks import unique
-    from freegeo.cli.options import use_few_threads
 
     if not experiments:
         raise UserError("name at least one experiment, or all; `freegeo bench list` lists them.")
@@ -246,18 +247,32 @@ def _prepare(
             views=_numbers(bench.views, "--views"),
         )
     ]  # fmt: skip
-    steps = model.steps or (QUICK_STEPS if bench.quick and model.epochs is None else None)
+    changes = recipe.changes()
+    if bench.quick and recipe.steps is None and recipe.epochs is None:
+        changes["steps"] = QUICK_STEPS
     predictor = Predictor(
         Setup(
             data=bench.data, out=bench.output, model=model.model, checkpoint=model.checkpoint, device=model.device,
-            precision=model.precision, recipe=model.recipe,
-            changes={"steps": steps, "epochs": model.epochs, "lr": model.lr, "hold": model.hold},
-            adapt_per=model.adapt_per, adapt_seed=model.adapt_seed, epoch=model.epoch,
-            given_cameras=model.given_cameras, scenes=scenes, overwrite=overwrite,
+            precision=model.precision, recipe=recipe.recipe, changes=changes, adapt_per=options.adapt_per,
+            adapt_seed=model.seed, epoch=options.epoch, given_cameras=options.given_cameras, scenes=scenes,
+            overwrite=options.overwrite,
         )
     )  # fmt: skip
     use_few_threads(predictor.model)
+    _say_unpublished(names, recipe.recipe)
     return predictor, unique(tasks)
+
+
+def _say_unpublished(names: Sequence[str], recipe: str) -> None:
+    """Say which datasets have no settings of their own in a recipe that has one row per dataset."""
+    from freegeo.data.datasets.registry import get_dataset
+
+    without = [name for name in names if get_dataset(name).recipe_row is None]
+    if without and recipe != "scene":
+        console.note(
+            f"recipe '{recipe}' has no settings for {', '.join(without)}; those of generated rooms are used "
+            '(docs/benchmark.md, "Adding a dataset").'
+        )
 
 
 def _predict(
@@ -318,7 +333,7 @@ def _evaluate(bench: BenchOptions, device: str | None, *, wanted: list[Task] | N
 def _tables(experiments: Sequence[str], bench: BenchOptions) -> None:
     """Print the tables as text and write them in every format."""
     from freegeo.benchmark.paper.experiments import chosen
-    from freegeo.benchmark.paper.tables import FORMATS, as_text, experiment_tables
+    from freegeo.benchmark.paper.tables import TABLE_WRITERS, as_text, experiment_tables
     from freegeo.benchmark.results import read_results
     from freegeo.files import atomic_path
 
@@ -331,7 +346,7 @@ def _tables(experiments: Sequence[str], bench: BenchOptions) -> None:
             continue
         for table in tables:
             console.say(f"\n{as_text(table)}")
-        for ending, layout in FORMATS.items():
+        for ending, layout in TABLE_WRITERS.items():
             with atomic_path(bench.output / TABLES / f"{entry.name}.{ending}") as part:
                 part.write_text("\n".join(layout(table) for table in tables), encoding="utf-8")
     console.say(f"tables: {bench.output / TABLES}")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-from cyclopts import App
+from cyclopts import App, Parameter
 
 from freegeo.cli import console
 from freegeo.models import catalog
@@ -101,3 +102,51 @@ def check(model: str, checkpoint: Path) -> None:
     rules = item.keys() if item.keys else checkpoints.KeyRules()
     checkpoints.require_fit(catalog.build_empty(model), path, rules, model)
     console.say(f"{path}: fits {model} (fingerprint {checkpoints.fingerprint(path)})")
+
+
+@app.command
+def score(
+    model: str,
+    *,
+    checkpoint: Path | None = None,
+    output: Annotated[Path, Parameter(name=("--output", "-o"))] = Path("report-card.json"),
+    domains: str | None = None,
+    rooms: int = 200,
+) -> None:
+    """Score a model on generated rooms: 4 views, 8 views, and 4 views read off the features of 8.
+
+    This is the report card of docs/embedded-model.md; it runs on the CPU.
+
+    Parameters
+    ----------
+    model
+        Catalog name.
+    checkpoint
+        Local weight file or folder, such as the one that `freegeo train-tiny` writes.
+    output
+        Where the numbers are written as JSON.
+    domains
+        Kinds of rooms, separated by commas, the kind of the training first; default: all that are reported.
+    rooms
+        Rooms of each domain.
+    """
+    from freegeo.cli.options import use_few_threads
+    from freegeo.data.procedural import get_domain
+    from freegeo.errors import UserError
+    from freegeo.training.report_card import REPORTED_DOMAINS, card_tables, gate_lines, report_card
+
+    names = REPORTED_DOMAINS if domains is None else tuple(name.strip() for name in domains.split(","))
+    if rooms < 1:
+        raise UserError(f"--rooms must be at least 1, got {rooms}.")
+    for name in names:
+        get_domain(name).seeds(rooms)
+    loaded = catalog.load_model(model, checkpoint=checkpoint)
+    use_few_threads(loaded)
+    with console.progress_bar("domains", len(names)) as update:
+        card = report_card(
+            loaded, output, side=loaded.spec.default_side, domains=dict.fromkeys(names, rooms),
+            on_domain=lambda name: update(names.index(name), name),
+        )  # fmt: skip
+    console.say(card_tables(card))
+    console.say("\n".join(gate_lines(card)))
+    console.say(f"numbers: {output}")

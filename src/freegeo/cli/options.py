@@ -113,10 +113,15 @@ class RecipeOptions:
 
     def build(self, spec: ModelSpec) -> Recipe:
         """Return the recipe for a model."""
-        return named(self.recipe, spec, self.dataset).changed(
-            views=self.views, keep=parse_keep(self.keep), steps=self.steps, epochs=self.epochs,
-            sets_per_scene=self.sets, lr=self.lr, rank=self.rank, hold=self.hold, loss=parse_loss(self.loss),
-        )  # fmt: skip
+        return named(self.recipe, spec, self.dataset).changed(**self.changes())
+
+    def changes(self) -> dict[str, Any]:
+        """Return what `Recipe.changed` takes: every setting of the recipe, None where the option was left out."""
+        return {
+            "views": self.views, "keep": parse_keep(self.keep), "steps": self.steps, "epochs": self.epochs,
+            "sets_per_scene": self.sets, "lr": self.lr, "rank": self.rank, "hold": self.hold,
+            "loss": parse_loss(self.loss),
+        }  # fmt: skip
 
 
 def parse_keep(text: str | None) -> tuple[int, ...] | None:

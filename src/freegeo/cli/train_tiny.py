@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from freegeo.cli import console
+from freegeo.models.catalog import EMBEDDED_MODEL
 
 
 def train_tiny(
@@ -68,6 +69,7 @@ def train_tiny(
             continue_from=continue_from, progress=lambda state: update(min(state.seen, config.views)),
         )  # fmt: skip
     console.say(f"weights: {weights} ({console.size(weights)})")
+    console.say(f"score them: freegeo models score {EMBEDDED_MODEL} --checkpoint {weights}")
     log = output / LOG
     if log.is_file():
         console.say(f"learning curve: {plot_learning_curve(log, output / 'learning-curve.png')}")

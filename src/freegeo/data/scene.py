@@ -4,13 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Self
 
 from torch import Tensor
 
-from freegeo.data.datasets.base import SceneTruth
 from freegeo.errors import UserError
 from freegeo.types import PhotoLike
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneTruth:
+    """Where the ground truth of a scene lies; tuples have one entry per frame, None where a frame has no such file."""
+
+    dataset: str
+    """Name of the dataset whose constants and readers apply."""
+    surface: Path
+    """Mesh or point cloud."""
+    depth: tuple[Path | None, ...]
+    mask: tuple[Path | None, ...]
+    camera_hw: tuple[tuple[int, int], ...]
+    """Size the intrinsics refer to."""
+
+    def select(self, views: Sequence[int]) -> Self:
+        """Return the same scene with the chosen frames, in the order given."""
+        return replace(
+            self,
+            depth=tuple(self.depth[i] for i in views),
+            mask=tuple(self.mask[i] for i in views),
+            camera_hw=tuple(self.camera_hw[i] for i in views),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

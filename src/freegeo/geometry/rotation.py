@@ -9,6 +9,7 @@ from torch import Tensor
 
 __all__ = [
     "matrix_to_quat_xyzw",
+    "mean_rotation",
     "quat_wxyz_to_xyzw",
     "quat_xyzw_to_matrix",
     "quat_xyzw_to_wxyz",
@@ -105,6 +106,18 @@ def rotation_angle(matrix_a: Tensor, matrix_b: Tensor) -> Tensor:
     twice_sine = torch.stack((skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]), dim=-1)
     twice_cosine = relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1
     return torch.atan2(torch.linalg.vector_norm(twice_sine, dim=-1), twice_cosine)
+
+
+def mean_rotation(matrices: Tensor) -> Tensor:
+    """Rotation matrix (..., 3, 3) nearest to the mean of rotation matrices (..., S, 3, 3).
+
+    The mean of the entries is projected onto the rotations by its singular vectors (the chordal mean), with the sign of
+    the last one turned where the projection would be a reflection.
+    """
+    U, _, Vh = torch.linalg.svd(matrices.mean(dim=-3))
+    signs = torch.ones_like(U[..., 0, :])
+    signs[..., 2] = torch.linalg.det(U @ Vh).sign()
+    return (U * signs[..., None, :]) @ Vh
 
 
 def rotate(matrix: Tensor, vectors: Tensor) -> Tensor:

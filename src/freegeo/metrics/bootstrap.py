@@ -1,4 +1,4 @@
-"""Bootstrap interval of a mean difference, resampling whole rooms."""
+"""Bootstrap interval of a mean difference, resampling whole scenes."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -33,7 +33,7 @@ def paired_interval(
 ) -> Interval:
     """Percentile bootstrap interval of the mean of paired differences.
 
-    Entries of one cluster (the seeds, view sets or domains of one room) are not independent, so clusters are drawn
+    Entries of one cluster (the seeds, view sets or domains of one scene) are not independent, so clusters are drawn
     with replacement and enter with all their entries; the statistic is the plain mean over all drawn entries.
 
     Args:

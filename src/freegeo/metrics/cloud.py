@@ -1,4 +1,4 @@
-"""Cloud score of the published protocol: accuracy, completeness, their mean, precision, recall and F1.
+"""Cloud score of the published evaluation: accuracy, completeness, their mean, precision, recall and F1.
 
 Clouds are NumPy arrays (n, 3) in metres, float64 inside. Voxel averages come out in Morton (Z-curve) order: neighbours
 in space are neighbours in memory, which halves the time of the KD-tree searches and leaves every distance unchanged.
@@ -9,12 +9,12 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from freegeo.errors import UserError
 from freegeo.geometry import se3
 from freegeo.geometry.depth import depth_to_world, valid_depth
+from freegeo.geometry.rotation import mean_rotation
 
 _MORTON_BITS = 21
 _RELATIVE_THRESHOLD = 0.05
@@ -75,7 +75,8 @@ class ReferenceCloud:
             predicted: (n, 3) metres, in the frame of the ground truth.
             threshold: metres; a point counts when its distance is strictly below.
 
-        Source: benchmark protocol, section 8. An empty cloud on either side gives infinite distances and zero shares.
+        An empty cloud on either side gives infinite distances and zero shares.
+        Source: docs/benchmark.md, "Fusion and scoring".
         """
         points = _prepared(predicted, self.down_sample)
         if len(points) == 0 or len(self.points) == 0:
@@ -114,7 +115,7 @@ def voxel_average(points: np.ndarray, voxel: float) -> np.ndarray:
     Returns:
         (m, 3) float64 with m <= n.
 
-    Source: benchmark protocol, section 7, voxel averaging.
+    Source: docs/benchmark.md, "Fusion and scoring".
     """
     if not voxel > 0:
         raise UserError(f"The voxel edge must be positive, not {voxel}.")
@@ -180,7 +181,7 @@ def f1_rel5(
     Raises:
         UserError: the shapes do not fit, or a prediction has no pixel with a valid depth on both sides.
 
-    Source: embedded-model sheet, section 5.
+    Source: ours (docs/benchmark.md, "Generated rooms").
     """
     chosen = list(range(depth_pred.shape[0])) if views is None else list(views)
     if len(chosen) != depth_pred.shape[0] or depth_pred.shape[1:] != depth_gt.shape[1:]:
@@ -209,9 +210,7 @@ def _coarse_similarity(
     if not both.any():
         raise UserError("The prediction has no pixel with a valid depth in both prediction and ground truth.")
     s = (depth_gt[both] / depth_pred[both]).median()
-    U, _, Vh = torch.linalg.svd((T_gt[:, :3, :3].mT @ T_pred[:, :3, :3]).mean(dim=0))
-    handedness = torch.diag(torch.stack([s.new_tensor(1.0), s.new_tensor(1.0), torch.det(U @ Vh)]))
-    R = U @ handedness @ Vh
+    R = mean_rotation(T_gt[:, :3, :3].mT @ T_pred[:, :3, :3])
     centre_pred, centre_gt = (se3.camera_centres(T).mean(dim=0) for T in (T_pred, T_gt))
     return R, s, centre_gt - s * R @ centre_pred
 

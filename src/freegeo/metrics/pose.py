@@ -1,4 +1,4 @@
-"""Pose score of the published protocol: relative errors over all view pairs and the area under their recall curve.
+"""Pose score of the published evaluation: relative errors over all view pairs and the area under their recall curve.
 
 Every function takes world-to-camera matrices `T_cam_world` (OpenCV axes) and works in the floating type of its inputs:
 the published numbers are float32 numbers. The scale and the world frame of the prediction do not matter.
@@ -44,7 +44,7 @@ def pair_errors(T_cam_world_pred: Tensor, T_cam_world_gt: Tensor) -> PairErrors:
     Raises:
         UserError: the two disagree in the number of views, or are not stacks of pose matrices.
 
-    Source: benchmark protocol, section 4, steps 1 to 4.
+    Source: docs/benchmark.md, "Pose score".
     """
     _check_poses(T_cam_world_pred, T_cam_world_gt)
     T_pred, T_gt = _relative_poses(T_cam_world_pred), _relative_poses(T_cam_world_gt)
@@ -62,7 +62,7 @@ def area_under_curve(errors_deg: Tensor, threshold_deg: int) -> Tensor:
     Returns:
         (...) float64 in [0, 1]; NaN when there is no pair.
 
-    Source: benchmark protocol, section 4, step 6.
+    Source: docs/benchmark.md, "Pose score".
     """
     if threshold_deg != int(threshold_deg) or threshold_deg < 1:
         raise UserError(f"The threshold of a pose score is a whole number of degrees from 1 up, not {threshold_deg}.")

@@ -19,6 +19,7 @@ from freegeo.export.formats import filter_reconstruction
 from freegeo.export.reconstruction import FILE_NAME, Reconstruction
 from freegeo.files import FORMAT, read_json
 from freegeo.geometry.depth import depth_to_world, valid_depth
+from freegeo.geometry.rotation import mean_rotation, rotation_angle
 from freegeo.geometry.se3 import camera_centres
 from freegeo.geometry.sim3 import Sim3
 
@@ -172,10 +173,7 @@ def align(estimate: Reconstruction, reference: Reconstruction) -> Sim3:
 def _similarity(depth: np.ndarray, T: np.ndarray, depth_reference: np.ndarray, T_reference: np.ndarray) -> Sim3:
     scale = median_ratio(depth_reference, depth)
     cameras, goal = torch.from_numpy(T).double(), torch.from_numpy(T_reference).double()
-    U, _, Vh = torch.linalg.svd((goal[:, :3, :3].mT @ cameras[:, :3, :3]).mean(0))
-    signs = torch.ones(3, dtype=torch.float64)
-    signs[2] = torch.linalg.det(U @ Vh).sign()
-    R = (U * signs) @ Vh
+    R = mean_rotation(goal[:, :3, :3].mT @ cameras[:, :3, :3])
     t = (camera_centres(goal) - scale * camera_centres(cameras) @ R.mT).median(0).values
     return Sim3(s=torch.tensor(scale, dtype=torch.float64), R=R, t=t)
 
@@ -232,9 +230,9 @@ def camera_difference(estimate: Stage, reference: Stage) -> tuple[np.ndarray, np
     assert estimate.T_cam_world is not None
     assert reference.T_cam_world is not None
     a, b = (torch.from_numpy(s.T_cam_world).double() for s in (estimate, reference))
-    cosine = ((a[:, :3, :3] * b[:, :3, :3]).sum((-2, -1)) - 1) / 2
+    angle = rotation_angle(a[:, :3, :3], b[:, :3, :3])
     distance = torch.linalg.vector_norm(camera_centres(a) - camera_centres(b), dim=-1)
-    return torch.rad2deg(cosine.clamp(-1, 1).arccos()).numpy(), distance.numpy()
+    return torch.rad2deg(angle).numpy(), distance.numpy()
 
 
 def _mapping(path: Path) -> Mapping[str, Any]:

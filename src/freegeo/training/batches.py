@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from freegeo.geometry import se3
-from freegeo.training.config import Stage, TrainConfig
+from freegeo.training.config import Phase, TrainConfig
 from freegeo.training.pool import Pool, Rooms
 
 
@@ -32,10 +32,10 @@ class Batch:
         return self.images.shape[0] * self.images.shape[1]
 
 
-def window(frames: int, views: int, stage: Stage, generator: torch.Generator) -> list[int]:
+def window(frames: int, views: int, phase: Phase, generator: torch.Generator) -> list[int]:
     """Draw `views` frame numbers with a random stride, in walking order or reversed."""
     steps = max(views - 1, 1)
-    most = min(stage.max_stride, max(1, stage.reach // steps), (frames - 1) // steps)
+    most = min(phase.max_stride, max(1, phase.reach // steps), (frames - 1) // steps)
     stride = int(torch.randint(1, most + 1, (), generator=generator))
     start = int(torch.randint(frames - stride * (views - 1), (), generator=generator))
     picked = list(range(start, start + stride * views, stride))
@@ -45,11 +45,11 @@ def window(frames: int, views: int, stage: Stage, generator: torch.Generator) ->
 def draw_batch(
     pool: Pool, config: TrainConfig, seen: int, generator: torch.Generator, device: torch.device | str = "cpu"
 ) -> Batch:
-    """Draw one step's samples for the stage of the run; the numbers are drawn on the CPU whatever the device."""
-    stage = config.stage(seen)
-    views = stage.views[int(torch.randint(len(stage.views), (), generator=generator))]
+    """Draw one step's samples for the phase of the run; the numbers are drawn on the CPU whatever the device."""
+    phase = config.phase(seen)
+    views = phase.views[int(torch.randint(len(phase.views), (), generator=generator))]
     picks = pool.draw(max(1, config.views_per_step // views), generator)
-    parts = [(rooms, room, torch.tensor(window(rooms.frames, views, stage, generator))) for rooms, room in picks]
+    parts = [(rooms, room, torch.tensor(window(rooms.frames, views, phase, generator))) for rooms, room in picks]
     gathered = Rooms(
         **{
             name: torch.stack([getattr(rooms, name)[room, frames] for rooms, room, frames in parts]).to(device)
@@ -57,8 +57,8 @@ def draw_batch(
         }
     )
     batch = to_batch(gathered)
-    if stage.side != pool.side:
-        batch = shrink(batch, stage.side / pool.side, pool.patch)
+    if phase.side != pool.side:
+        batch = shrink(batch, phase.side / pool.side, pool.patch)
     return augment(batch, generator)
 
 

@@ -12,7 +12,7 @@ _LARGEST = {"peak": 1.0, "cooldown": 1.0}
 
 @dataclass(frozen=True, kw_only=True)
 class LossWeights:
-    """Weights of the training objective (embedded-model spec, section 4)."""
+    """Weights of the training objective (docs/embedded-model.md, "Training objective")."""
 
     depth: float = 2.0
     cell_depth: float = 2.0
@@ -29,8 +29,8 @@ class LossWeights:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stage:
-    """What samples are like at one point of a run."""
+class Phase:
+    """What samples are like in one part of the curriculum."""
 
     views: tuple[int, ...]
     """Possible numbers of views in a sample."""
@@ -93,14 +93,14 @@ class TrainConfig:
                 limits = f"at least {smallest:g}" + (f" and at most {largest:g}" if largest is not None else "")
                 raise UserError(f"cannot train with {name.replace('_', '-')} {value}. Give {limits}.")
 
-    def stage(self, seen: int) -> Stage:
+    def phase(self, seen: int) -> Phase:
         """Return what is learned from after `seen` views: short windows come first, and small images."""
         side = self.side * 3 // 4 if seen < self.small_until else self.side
         if seen < self.pairs_until:
-            return Stage(views=(2, 3), max_stride=1, reach=self.reach, side=side)
+            return Phase(views=(2, 3), max_stride=1, reach=self.reach, side=side)
         if seen < self.short_until:
-            return Stage(views=(2, 3, 4), max_stride=2, reach=self.reach, side=side)
-        return Stage(views=(2, 4, 4, 4, 6, 8, 8, 8, 12, 16), max_stride=3, reach=self.reach, side=side)
+            return Phase(views=(2, 3, 4), max_stride=2, reach=self.reach, side=side)
+        return Phase(views=(2, 4, 4, 4, 6, 8, 8, 8, 12, 16), max_stride=3, reach=self.reach, side=side)
 
     def rate(self, seen: int) -> float:
         """Return the factor on all learning rates: warm-up, plateau, quadratic cool-down to zero."""

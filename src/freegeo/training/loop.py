@@ -17,14 +17,24 @@ from torch import nn
 
 from freegeo import __version__
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import atomic_path, read_json, write_json, write_tensors
+from freegeo.files import as_json, atomic_path, read_json, write_json, write_tensors
 from freegeo.run_folder import locked
 from freegeo.training.batches import Batch, draw_batch
 from freegeo.training.config import TrainConfig
-from freegeo.training.evaluate import evaluate
 from freegeo.training.objective import objective, zero_motion_rotation
 from freegeo.training.pool import ASPECTS, Pool
-from freegeo.training.state import PLATEAU, PLATEAU_LR, START, STATE, State, averaged, new_state, resume, save
+from freegeo.training.report_card import score_rooms
+from freegeo.training.state import (
+    NEWEST_FILE,
+    PLATEAU_FILE,
+    PLATEAU_LR,
+    START_FILE,
+    State,
+    averaged,
+    new_state,
+    resume,
+    save,
+)
 from freegeo.training.workers import Crew
 
 logger = logging.getLogger(__name__)
@@ -61,7 +71,7 @@ def train(
         raise UserError(f"cannot train with {workers} workers on {device}. Use one, or several on the cpu.")
     with locked(folder), one_thread(device):
         config = begin(config, folder, continue_from)
-        require_same_settings(config, folder)
+        keep_settings(config, folder)
         state = new_state(config, device)
         resume(state, config, folder)
         pool = open_pool(config, state, folder, device)
@@ -73,8 +83,8 @@ def train(
                 trainer.step()
                 trainer.keep_record()
                 progress(state)
-        save(state, config, folder / STATE)
-        return export(state, config, folder / WEIGHTS)
+        save(state, config, folder / NEWEST_FILE)
+        return write_weights(state, config, folder / WEIGHTS)
 
 
 @contextmanager
@@ -131,15 +141,15 @@ class Trainer:
         state, (step_before, seen_before) = self.state, self.recorded
         self.recorded = (state.step, state.seen)
         if seen_before < self.config.cooldown_start <= state.seen:
-            save(state, self.config, self.folder / PLATEAU)
+            save(state, self.config, self.folder / PLATEAU_FILE)
         if time.monotonic() - self.saved_at > SAVE_EVERY_S:
-            save(state, self.config, self.folder / STATE)
+            save(state, self.config, self.folder / NEWEST_FILE)
             self.saved_at = time.monotonic()
         if state.step // LOG_EVERY_STEPS > step_before // LOG_EVERY_STEPS:
             self.log("step", {name: round(value, 5) for name, value in self.recent.items()})
         if state.seen // EVALUATE_EVERY_VIEWS > seen_before // EVALUATE_EVERY_VIEWS:
-            report = evaluate(averaged(state), "val-id", EVALUATION_ROOMS, side=self.config.side)
-            self.log("evaluation", {mode: report.mean(mode) for mode in report.per_room})
+            scores = score_rooms(averaged(state), "val-id", EVALUATION_ROOMS, side=self.config.side)
+            self.log("evaluation", {mode: scores.mean(mode) for mode in scores.per_room})
 
     def log(self, kind: str, values: dict[str, Any]) -> None:
         """Append one line to the run's log."""
@@ -162,9 +172,9 @@ def apply_gradients(state: State, config: TrainConfig) -> None:
     torch._foreach_lerp_(list(state.average.values()), [p.detach() for p in state.model.parameters()], 1 - decay)
 
 
-def require_same_settings(config: TrainConfig, folder: Path) -> None:
+def keep_settings(config: TrainConfig, folder: Path) -> None:
     """Store the settings, or refuse to go on with other ones; only the view budget may change."""
-    settings, defaults = (json.loads(json.dumps(asdict(each))) for each in (config, TrainConfig()))
+    settings, defaults = (as_json(asdict(each)) for each in (config, TrainConfig()))
     path = folder / CONFIG
     if path.is_file():
         before = defaults | read_json(path)  # a run may be older than a setting
@@ -176,11 +186,11 @@ def require_same_settings(config: TrainConfig, folder: Path) -> None:
 
 def begin(config: TrainConfig, folder: Path, continue_from: Path | None) -> TrainConfig:
     """Copy the state of the run to continue, once, and return the settings with where that run stood."""
-    start = folder / START
+    start = folder / START_FILE
     if continue_from is not None and not start.is_file():
         if (folder / CONFIG).is_file():
             raise UserError(f"{folder}: holds a run that continues no other. Choose a new folder.")
-        source = continue_from / STATE
+        source = continue_from / NEWEST_FILE
         if not source.is_file():
             raise UserError(f"{source}: not found, so there is no run to continue. Name the folder of a training run.")
         with atomic_path(start) as part:
@@ -215,7 +225,7 @@ def open_pool(config: TrainConfig, state: State, folder: Path, device: str) -> P
     return pool
 
 
-def export(state: State, config: TrainConfig, path: Path) -> Path:
+def write_weights(state: State, config: TrainConfig, path: Path) -> Path:
     """Write the averaged weights in half precision, under the official DA3 names, with where they come from."""
     tensors = {f"model.{name}": value.half().cpu() for name, value in state.average.items()}
     metadata = {

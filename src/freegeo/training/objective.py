@@ -1,6 +1,7 @@
 """The training objective: dense depth, relative cameras, per-token rays and points, cross-view matching.
 
-Follows the embedded-model spec, section 4. Letters: B samples, S views, P patches, Q cells (2 x 2 a patch), C channels.
+Source: docs/embedded-model.md, "Training objective".
+Letters: B samples, S views, P patches, Q cells (2 x 2 a patch), C channels.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from freegeo.training.objective import ReadOuts
 
 logger = logging.getLogger(__name__)
 
-STATE, PLATEAU, START = "state.pt", "plateau.pt", "start.pt"
+NEWEST_FILE, PLATEAU_FILE, START_FILE = "state.pt", "plateau.pt", "start.pt"
 """Newest state; state before the cool-down; state of the run that this one continues."""
 FIRST_FOV_RAD = 1.0
 MUON_PARTS = ("backbone.pretrained.blocks.", "cam_dec.backbone.")
@@ -169,12 +169,12 @@ def averaged(state: State) -> DA3:
 
 def resume(state: State, config: TrainConfig, folder: Path) -> None:
     """Continue from the newest state that fits the view budget."""
-    for name in (STATE, PLATEAU, START):
+    for name in (NEWEST_FILE, PLATEAU_FILE, START_FILE):
         path = folder / name
         if not path.is_file():
             continue
         saved = torch.load(path, weights_only=True, map_location=next(state.model.parameters()).device)
-        cooling = name == STATE and saved["counters"][1] > saved["cooldown_start"]
+        cooling = name == NEWEST_FILE and saved["counters"][1] > saved["cooldown_start"]
         if cooling and saved["cooldown_start"] < config.cooldown_start:
             continue
         state.restore(saved)

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from freegeo.benchmark.evaluate import GROUND_TRUTH, fuse_scene, load_reference
 from freegeo.benchmark.paper.tables import NAMES, short_name
 from freegeo.benchmark.results import Row, choose, mean, read_results
+from freegeo.benchmark.scene_score import GROUND_TRUTH, fuse_scene, load_reference
 from freegeo.benchmark.stored import read_stored
 from freegeo.benchmark.tasks import DAMAGED, Task, reason_of, stored_tasks
 from freegeo.data.datasets.registry import load_scene, true_depth
@@ -222,7 +222,7 @@ def _draw_pair(data: Path, out: Path, name: str, one: Task, other: Task) -> list
     pairs = list(zip(titles, (one, other), strict=True))
     heading = f"{short_name(one.dataset)} {one.scene}, {one.views} views"
     clouds = [cloud_panel(title, scene, task, out, reference.cloud.points) for title, task in pairs]
-    threshold = reference.protocol.threshold
+    threshold = reference.constants.threshold
     files = save_figure(
         cloud_figure(clouds, reference.cloud.points, threshold, f"{heading}: fused surface"),
         Path(out) / FOLDER / f"cloud-{name}",

@@ -11,6 +11,7 @@ from freegeo.benchmark.paper.experiments import ROOMS, Experiment, Line, dataset
 from freegeo.benchmark.paper.published import FAMILIES, Cell, PaperTable, paper_table
 from freegeo.benchmark.results import SMALLER_IS_BETTER, Row, choose, entries, mean, paired
 from freegeo.benchmark.tasks import FrameRule
+from freegeo.data.procedural.splits import PREFIX
 from freegeo.metrics.bootstrap import Interval
 
 EMPTY = ""
@@ -228,12 +229,12 @@ def verdict(metric: str, interval: Interval, scenes: int) -> str:
 
 def metrics_of(entry: Experiment, dataset: str) -> tuple[str, ...]:
     """The metrics that are shown for a dataset."""
-    return entry.room_metrics if dataset.startswith("procedural-") else entry.metrics
+    return entry.room_metrics if dataset.startswith(PREFIX) else entry.metrics
 
 
 def short_name(dataset: str) -> str:
     """A dataset's name in a header."""
-    return dataset.removeprefix("procedural-")
+    return dataset.removeprefix(PREFIX)
 
 
 def number(value: float | None, metric: str) -> str:
@@ -286,7 +287,7 @@ def as_latex(table: Table) -> str:
     return "\n".join(lines) + "\n"
 
 
-FORMATS: Mapping[str, Callable[[Table], str]] = {
+TABLE_WRITERS: Mapping[str, Callable[[Table], str]] = {
     "txt": as_text, "md": as_markdown, "csv": as_csv, "tex": as_latex,
 }  # fmt: skip
 

@@ -1,1 +1,1 @@
-"""The datasets of the benchmark: one file per dataset, one registry."""
+"""The datasets of the benchmark: the contract (`base`), one file for each, and their list (`registry`)."""

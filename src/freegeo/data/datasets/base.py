@@ -1,23 +1,29 @@
-"""What the published evaluation fixes per dataset, and the ground-truth files of a scene."""
+"""What a dataset of the benchmark has to say about itself, and helpers that its loader may use."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
 
+from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError, UserError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Protocol:
-    """Constants of one dataset; lengths in metres. Source: benchmark protocol, section 1.1."""
+class DatasetConstants:
+    """What the evaluation fixes for one dataset; lengths in metres.
 
-    dataset: str
+    Source of the published values: docs/benchmark.md, "Constants of the datasets".
+    """
+
     voxel: float
     """Voxel edge of the fusion."""
     truncation: float
+    """Distance at which the signed distance of the fusion is cut."""
     depth_limit: float
     """Depths from here on are not fused."""
     down_sample: float
@@ -37,34 +43,45 @@ class Protocol:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneTruth:
-    """Where the ground truth of a scene lies; tuples have one entry per frame, None where a frame has no such file."""
+class Dataset:
+    """A dataset of the benchmark: its constants, and the functions that read its files.
 
-    dataset: str
-    surface: Path
-    """Mesh or point cloud."""
-    depth: tuple[Path | None, ...]
-    mask: tuple[Path | None, ...]
-    camera_hw: tuple[tuple[int, int], ...]
-    """Size the intrinsics refer to."""
+    `root` is the dataset's own folder, `<data>/<name>`, in every function. One such value at the end of the dataset's
+    file and one entry of `registry.DATASETS` make a dataset known to every command.
+    """
 
-    def select(self, views: Sequence[int]) -> Self:
-        """The same scene with the chosen frames, in the order given."""
-        return replace(
-            self,
-            depth=tuple(self.depth[i] for i in views),
-            mask=tuple(self.mask[i] for i in views),
-            camera_hw=tuple(self.camera_hw[i] for i in views),
-        )
+    name: str
+    """Name on the command line and of the folder."""
+    constants: DatasetConstants
+    scene_names: Callable[[Path], Sequence[str]]
+    """(root): the scenes in the order of the evaluation. UserError when a list that belongs to the data is missing."""
+    load_scene: Callable[[Path, str], Scene]
+    """(root, name): photos, cameras and ground truth of a scene. UserError for a missing file, FreeGeoError for a
+    damaged one."""
+    read_depth: Callable[[Path, tuple[int, int]], np.ndarray] | None = None
+    """(path, size of the photo): a depth file of `SceneTruth.depth`, (H, W) float32 metres, 0 or infinity where there
+    is none. None: no depth files; a scene may carry its depth in memory."""
+    valid_mask: Callable[[SceneTruth, int, tuple[int, int]], np.ndarray | None] | None = None
+    """(truth, frame, fusion size): pixels of the frame that may be fused, (H, W) bool, or None where nothing says so.
+    None: no frame has such a mask."""
+    depth_of_every_frame: bool = True
+    """Whether a frame without a depth file is a gap in the data."""
+    recipe_row: str | None = None
+    """Row of the per-dataset settings of adaptation (`freegeo.adaptation.recipe`). None: nobody has published any, and
+    those of generated rooms are used."""
+    archive_gb: float | None = None
+    """Size of the dataset's archive on the hub; None: it is not there."""
+    generated: bool = False
+    """Whether scenes are rendered when they are first used, so that nothing can be missing."""
 
 
 def existing(path: Path) -> Path | None:
-    """The path, or None when there is no such file."""
+    """Return the path, or None when there is no such file."""
     return path if path.is_file() else None
 
 
 def require_folder(path: Path, what: str) -> Path:
-    """The path of an existing folder; UserError names what is missing."""
+    """Return the path of an existing folder; UserError names what is missing."""
     if not path.is_dir():
         raise UserError(f"{path}: no such folder, {what}. Check the name and where the benchmark data was unpacked.")
     return path

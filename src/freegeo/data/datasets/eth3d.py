@@ -9,7 +9,7 @@
 ```
 
 Frames come in the order of images.txt. The lens distortion of the raw JPEGs is set aside, as published. Source:
-benchmark protocol, section 1.2.
+docs/benchmark.md, "Files of a scene".
 """
 
 from pathlib import Path
@@ -18,9 +18,9 @@ import numpy as np
 import torch
 
 from freegeo.data.colmap_files import read_cameras, read_images
-from freegeo.data.datasets.base import Protocol, SceneTruth, existing, read_gray, require_folder
+from freegeo.data.datasets.base import Dataset, DatasetConstants, existing, read_gray, require_folder
 from freegeo.data.photos import load_photos
-from freegeo.data.scene import Scene
+from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError
 
 SCENES = (
@@ -36,15 +36,7 @@ SCENES = (
     "relief_2",
     "terrains",
 )
-PROTOCOL = Protocol(
-    dataset="eth3d",
-    voxel=5 * 4 / 512,
-    truncation=0.2,
-    depth_limit=100_000.0,
-    down_sample=5 * 4 / 512,
-    threshold=0.25,
-    truth="mesh",
-)
+NAME = "eth3d"
 EXCLUDED = {  # frames left out, by the number at the end of their name
     "delivery_area": range(711, 715),
     "electro": (*range(9289, 9294), 9298),
@@ -85,7 +77,7 @@ def load_scene(root: Path, name: str) -> Scene:
         T_cam_world=torch.tensor(np.stack([image.T_cam_world for image in images]), dtype=torch.float32),
         K=torch.tensor(np.stack([cameras[image.camera].K for image in images]), dtype=torch.float32),
         truth=SceneTruth(
-            dataset=PROTOCOL.dataset,
+            dataset=NAME,
             surface=folder / "combined_mesh.ply",
             depth=tuple(existing(depth / file.name) for file in files),
             mask=tuple(existing(masks / file.name.replace(".JPG", ".png")) for file in files),
@@ -118,3 +110,23 @@ def read_depth(path: Path, photo_hw: tuple[int, int]) -> np.ndarray:
     if path.stat().st_size != 4 * height * width:
         raise FreeGeoError(f"{path}: {path.stat().st_size} bytes do not fit an image of {width} x {height} pixels.")
     return np.fromfile(path, dtype="<f4").reshape(photo_hw)
+
+
+ETH3D = Dataset(
+    name=NAME,
+    constants=DatasetConstants(
+        voxel=5 * 4 / 512,
+        truncation=0.2,
+        depth_limit=100_000.0,
+        down_sample=5 * 4 / 512,
+        threshold=0.25,
+        truth="mesh",
+    ),
+    scene_names=scene_names,
+    load_scene=load_scene,
+    read_depth=read_depth,
+    valid_mask=valid_mask,
+    depth_of_every_frame=False,  # only where a laser scan was rendered
+    recipe_row=NAME,
+    archive_gb=14.1,
+)

@@ -10,7 +10,7 @@
 <root>/fused_pcd/<a>-<b>-<c>.ply                   ground-truth points; a, b, c are the components of the scene name
 ```
 
-Source: benchmark protocol, section 1.5.
+Source: docs/benchmark.md, "Files of a scene".
 """
 
 from pathlib import Path
@@ -18,20 +18,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from freegeo.data.datasets.base import Protocol, SceneTruth, existing, read_gray, require_folder
+from freegeo.data.datasets.base import Dataset, DatasetConstants, existing, read_gray, require_folder
 from freegeo.data.photos import load_photos
-from freegeo.data.scene import Scene
+from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError, UserError
 
-PROTOCOL = Protocol(
-    dataset="hiroom",
-    voxel=4 / 512,
-    truncation=0.04,
-    depth_limit=10_000.0,
-    down_sample=4 / 512,
-    threshold=0.05,
-    truth="points",
-)
+NAME = "hiroom"
 SCENE_LIST = "selected_scene_list_val.txt"
 _METRES_PER_STEP = 100 / 65535
 
@@ -65,7 +57,7 @@ def load_scene(root: Path, name: str) -> Scene:
         T_cam_world=torch.tensor(T, dtype=torch.float32),
         K=torch.tensor(_read_matrix(folder / "cam_K.npy"), dtype=torch.float32)[:3, :3].repeat(len(frames), 1, 1),
         truth=SceneTruth(
-            dataset=PROTOCOL.dataset,
+            dataset=NAME,
             surface=Path(root) / "fused_pcd" / f"{'-'.join(Path(name).parts[-3:])}.ply",
             depth=tuple(existing(folder / "depth" / f"{frame}.png") for frame in frames),
             mask=tuple(existing(folder / "aliasing_mask" / f"{frame}.png") for frame in frames),
@@ -102,3 +94,22 @@ def _read_matrix(path: Path) -> np.ndarray:
     if matrix.ndim != 2 or min(matrix.shape) < 3:
         raise FreeGeoError(f"{path}: a matrix was expected, not shape {matrix.shape}.")
     return matrix
+
+
+HIROOM = Dataset(
+    name=NAME,
+    constants=DatasetConstants(
+        voxel=4 / 512,
+        truncation=0.04,
+        depth_limit=10_000.0,
+        down_sample=4 / 512,
+        threshold=0.05,
+        truth="points",
+    ),
+    scene_names=scene_names,
+    load_scene=load_scene,
+    read_depth=read_depth,
+    valid_mask=valid_mask,
+    recipe_row=NAME,
+    archive_gb=0.7,
+)

@@ -1,48 +1,61 @@
-"""The datasets of the benchmark by name, behind one set of functions: the published ones and generated rooms."""
+"""The datasets of the benchmark by name: the published ones and every split of the generated rooms."""
+
+from __future__ import annotations
 
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from freegeo.data.datasets import eth3d, hiroom, scannetpp, sevenscenes
-from freegeo.data.datasets.base import Protocol, SceneTruth
-from freegeo.data.procedural.splits import SPLITS, RoomSplit
-from freegeo.data.scene import Scene
+from freegeo.data.datasets.base import Dataset, DatasetConstants
+from freegeo.data.datasets.eth3d import ETH3D
+from freegeo.data.datasets.hiroom import HIROOM
+from freegeo.data.datasets.scannetpp import SCANNETPP
+from freegeo.data.datasets.sevenscenes import SEVEN_SCENES
+from freegeo.data.procedural.splits import SPLITS
+from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import UserError
 from freegeo.geometry.resample import resize_nearest
 
-PUBLISHED: dict[str, ModuleType] = {
-    "eth3d": eth3d,
-    "7scenes": sevenscenes,
-    "scannetpp": scannetpp,
-    "hiroom": hiroom,
+DATASETS: dict[str, Dataset] = {
+    dataset.name: dataset
+    for dataset in (
+        ETH3D,
+        SEVEN_SCENES,
+        SCANNETPP,
+        HIROOM,
+        *SPLITS,
+    )
 }
-"""Key, which is also the folder in the unpacked archive, to module."""
-DATASETS: dict[str, ModuleType | RoomSplit] = {**PUBLISHED, **SPLITS}
-"""The same with every split of the generated rooms, such as `procedural-light`."""
 
 
-def protocol(dataset: str) -> Protocol:
-    """Constants of a dataset; UserError lists the names when this one is unknown."""
-    return _module(dataset).PROTOCOL
+def get_dataset(name: str) -> Dataset:
+    """Return a dataset by name; UserError lists the names when this one is unknown."""
+    if name not in DATASETS:
+        raise UserError(f"There is no dataset {name!r}; known are {', '.join(DATASETS)}.")
+    return DATASETS[name]
 
 
-def scene_names(bench: Path, dataset: str) -> list[str]:
-    """Published scenes of a dataset in their order; `bench` is the folder of the unpacked archive."""
-    return _module(dataset).scene_names(Path(bench) / dataset)
+def constants(dataset: str) -> DatasetConstants:
+    """Return what the evaluation fixes for a dataset."""
+    return get_dataset(dataset).constants
 
 
-def load_scene(bench: Path, dataset: str, scene: str) -> Scene:
-    """Read one scene of `<bench>/<dataset>`; errors as in the dataset's own module."""
-    return _module(dataset).load_scene(Path(bench) / dataset, scene)
+def scene_names(data: Path, dataset: str) -> list[str]:
+    """Return the scenes of a dataset in their order; `data` is the folder that holds `<dataset>/`."""
+    return list(get_dataset(dataset).scene_names(Path(data) / dataset))
+
+
+def load_scene(data: Path, dataset: str, scene: str) -> Scene:
+    """Read one scene of `<data>/<dataset>`; errors as in the dataset's own loader."""
+    return get_dataset(dataset).load_scene(Path(data) / dataset, scene)
 
 
 def valid_mask(truth: SceneTruth, index: int, size_hw: tuple[int, int]) -> np.ndarray | None:
-    """Pixels of one frame that may be fused, (H, W) bool at fusion size; None when the dataset sets no mask here."""
-    return _module(truth.dataset).valid_mask(truth, index, size_hw)
+    """Return the pixels of one frame that may be fused, (H, W) bool at fusion size; None where nothing says so."""
+    mask = get_dataset(truth.dataset).valid_mask
+    return None if mask is None else mask(truth, index, size_hw)
 
 
 def true_depth(scene: Scene, size_hw: tuple[int, int]) -> Tensor | None:
@@ -54,20 +67,18 @@ def true_depth(scene: Scene, size_hw: tuple[int, int]) -> Tensor | None:
     if scene.depth_z is not None:
         return resize_nearest(scene.depth_z, size_hw)
     truth = scene.truth
-    if truth is None or not any(truth.depth):
+    read_depth = None if truth is None else get_dataset(truth.dataset).read_depth
+    if truth is None or read_depth is None or not any(truth.depth):
         return None
     frames = []
     for index, (path, photo) in enumerate(zip(truth.depth, scene.photos, strict=True)):
         if path is None:
             frames.append(torch.zeros(size_hw))
             continue
-        depth = PUBLISHED[truth.dataset].read_depth(path, photo.size_hw)
-        known = np.isfinite(depth) & valid_mask(truth, index, (depth.shape[0], depth.shape[1]))
+        depth = read_depth(path, photo.size_hw)
+        known = np.isfinite(depth)
+        mask = valid_mask(truth, index, (depth.shape[0], depth.shape[1]))
+        if mask is not None:
+            known &= mask
         frames.append(resize_nearest(torch.from_numpy(np.where(known, depth, np.float32(0))), size_hw))
     return torch.stack(frames)
-
-
-def _module(dataset: str) -> ModuleType | RoomSplit:
-    if dataset not in DATASETS:
-        raise UserError(f"There is no dataset {dataset!r}; known are {', '.join(DATASETS)}.")
-    return DATASETS[dataset]

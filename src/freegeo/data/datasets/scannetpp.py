@@ -8,7 +8,7 @@
 ```
 
 Frames are the phone images (`iphone` in the name), sorted by name. The network sees the raw files; depth is fused at
-1024 x 768 with the matrix of the undistorted view. Source: benchmark protocol, section 1.4.
+1024 x 768 with the matrix of the undistorted view. Source: docs/benchmark.md, "Files of a scene".
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ import numpy as np
 import torch
 
 from freegeo.data.colmap_files import ColmapCamera, read_cameras, read_images
-from freegeo.data.datasets.base import Protocol, SceneTruth, existing, read_gray, require_folder
+from freegeo.data.datasets.base import Dataset, DatasetConstants, existing, read_gray, require_folder
 from freegeo.data.photos import load_photos
-from freegeo.data.scene import Scene
+from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError, UserError
 
 SCENES = (
@@ -45,18 +45,7 @@ SCENES = (
     "bcd2436daf",
     "cc5237fd77",
 )
-PROTOCOL = Protocol(
-    dataset="scannetpp",
-    voxel=0.02,
-    truncation=0.15,
-    depth_limit=5.0,
-    down_sample=0.02,
-    threshold=0.05,
-    truth="mesh",
-    crop_margin=0.1,
-    fusion_hw=(768, 1024),
-    posed_centre_shift=0.5,
-)
+NAME = "scannetpp"
 _COLMAP_CENTRE = 0.5
 
 
@@ -103,7 +92,7 @@ def load_scene(root: Path, name: str) -> Scene:
         T_cam_world=torch.tensor(np.stack([image.T_cam_world for image in images]), dtype=torch.float32),
         K=torch.tensor(np.stack([used[image.camera].K for image in images]), dtype=torch.float32),
         truth=SceneTruth(
-            dataset=PROTOCOL.dataset,
+            dataset=NAME,
             surface=Path(root) / name / "scans" / "mesh_aligned_0.05.ply",
             depth=tuple(existing(folder / "render_depth" / f"{file.name[:-4]}.png") for file in files),
             mask=(None,) * len(files),
@@ -144,3 +133,25 @@ def valid_mask(truth: SceneTruth, index: int, size_hw: tuple[int, int]) -> np.nd
 def read_depth(path: Path, photo_hw: tuple[int, int]) -> np.ndarray:
     """Rendered ground-truth depth (H, W) float32 metres, 0 where there is none. `photo_hw` is not used."""
     return read_gray(path).astype(np.float32) / 1000
+
+
+SCANNETPP = Dataset(
+    name=NAME,
+    constants=DatasetConstants(
+        voxel=0.02,
+        truncation=0.15,
+        depth_limit=5.0,
+        down_sample=0.02,
+        threshold=0.05,
+        truth="mesh",
+        crop_margin=0.1,
+        fusion_hw=(768, 1024),
+        posed_centre_shift=0.5,
+    ),
+    scene_names=scene_names,
+    load_scene=load_scene,
+    read_depth=read_depth,
+    valid_mask=valid_mask,
+    recipe_row=NAME,
+    archive_gb=10.1,
+)

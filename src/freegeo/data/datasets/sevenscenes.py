@@ -7,7 +7,7 @@
 <root>/7Scenes/meshes/<scene>.ply                    ground-truth mesh, metres
 ```
 
-Source: benchmark protocol, section 1.3.
+Source: docs/benchmark.md, "Files of a scene".
 """
 
 from pathlib import Path
@@ -15,21 +15,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from freegeo.data.datasets.base import Protocol, SceneTruth, existing, read_gray, require_folder
+from freegeo.data.datasets.base import Dataset, DatasetConstants, existing, read_gray, require_folder
 from freegeo.data.photos import load_photos
-from freegeo.data.scene import Scene
+from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError
 
 SCENES = ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs")
-PROTOCOL = Protocol(
-    dataset="7scenes",
-    voxel=4 / 512,
-    truncation=0.04,
-    depth_limit=1_000_000.0,
-    down_sample=4 / 512,
-    threshold=0.05,
-    truth="mesh",
-)
+NAME = "7scenes"
 K_COLOR = ((585.0, 0.0, 320.0), (0.0, 585.0, 240.0), (0.0, 0.0, 1.0))
 SIZE_HW = (480, 640)
 _SEQUENCE = {"stairs": ("seq-02", 500)}
@@ -61,7 +53,7 @@ def load_scene(root: Path, name: str) -> Scene:
         T_cam_world=torch.tensor(np.linalg.inv(poses), dtype=torch.float32),
         K=torch.tensor(K_COLOR).repeat(len(stems), 1, 1),
         truth=SceneTruth(
-            dataset=PROTOCOL.dataset,
+            dataset=NAME,
             surface=Path(root) / "7Scenes" / "meshes" / f"{name}.ply",
             depth=tuple(existing(_part(stem, "depth.png")) for stem in stems),
             mask=(None,) * len(stems),
@@ -91,3 +83,22 @@ def _read_pose(path: Path) -> np.ndarray:
         return np.loadtxt(path).reshape(4, 4)
     except ValueError as error:
         raise FreeGeoError(f"{path}: not a 4 x 4 matrix ({error}).") from error
+
+
+SEVEN_SCENES = Dataset(
+    name=NAME,
+    constants=DatasetConstants(
+        voxel=4 / 512,
+        truncation=0.04,
+        depth_limit=1_000_000.0,
+        down_sample=4 / 512,
+        threshold=0.05,
+        truth="mesh",
+    ),
+    scene_names=scene_names,
+    load_scene=load_scene,
+    read_depth=read_depth,
+    valid_mask=valid_mask,
+    recipe_row=NAME,
+    archive_gb=3.3,
+)

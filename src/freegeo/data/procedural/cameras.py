@@ -1,6 +1,6 @@
 """Camera trajectories inside a room: arcs that look inwards and walks that look outwards.
 
-Source: specification of the embedded model, section 2 (families, steps, jitter), pitfall 9 (long baselines of walks).
+Source: docs/embedded-model.md, "How the rooms are made" (families, steps, jitter, long baselines of walks).
 The room frame has its origin in the middle of the floor, z up. All functions are vectorised over rooms and read their
 randomness from uniform numbers in [0, 1], so that a room does not depend on the batch it is sampled in.
 """

@@ -1,13 +1,12 @@
 """The domains of generated rooms: one literal table.
 
-Source: specification of the embedded model, sections 2 (training distribution) and 9 (benchmark split). Every domain
-owns a range of room seeds that no other domain touches. A validation domain has its counterpart's appearance and
-texture bank and its own seeds, so that learning rates and numbers of steps are never chosen on rooms that are scored.
-Rooms that are scored are photographed with one lens from the middle of the training range (section 7, pitfall 4): at 64
-pixels a small model does not learn to tell lenses apart, and wrong intrinsics would cap every surface score. The domain
-`lens` keeps the range of lenses, so that what this costs stays visible. `sparse` (ours) has photos half as far again
-from one to the next: every second of them, what a student sees, turns by 48 degrees on average instead of 32, with a
-lens of 65.
+Source: docs/embedded-model.md, "How the rooms are made". Every domain owns a range of room seeds that no other domain
+touches. A validation domain has its counterpart's appearance and texture bank and its own seeds, so that learning rates
+and numbers of steps are never chosen on rooms that are scored. Rooms that are scored are photographed with one lens
+from the middle of the training range: at 64 pixels a small model does not learn to tell lenses apart, and wrong
+intrinsics would cap every surface score. The domain `lens` keeps the range of lenses, so that what this costs stays
+visible. `sparse` has photos half as far again from one to the next: every second of them, what a student sees, turns by
+48 degrees on average instead of 32, with a lens of 65.
 """
 
 from __future__ import annotations

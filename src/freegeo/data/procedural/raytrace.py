@@ -1,7 +1,7 @@
 """Analytic ray tracing of generated rooms: images, exact z-depth and cameras.
 
-Source: specification of the embedded model, section 2. The loop runs over the ten primitives; scenes, views and pixels
-are one flat dimension. Ray directions have unit z in the camera frame, so the ray parameter *is* the z-depth.
+The loop runs over the ten primitives; rooms, views and pixels are one flat dimension. Ray directions have unit z in the
+camera frame, so the ray parameter *is* the z-depth. Source: docs/embedded-model.md, "How the rooms are made".
 
 Pixels. Pixel u of a W pixels wide image covers [u, u + 1) of the image plane, whose middle W / 2 the optical axis
 meets; its ray goes through u + 0.5. That makes shrinking by area averaging exact. Written for integer pixel centres,

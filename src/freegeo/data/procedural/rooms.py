@@ -1,7 +1,7 @@
 """Sampling of generated rooms: what stands where, what it looks like, who looks at it.
 
-Source: specification of the embedded model, section 2. A room is a box of six faces with five yaw-rotated boxes, two
-spheres and two capped cylinders. Each room's numbers come from its own seed, never from its neighbours in a batch.
+A room is a box of six faces with five yaw-rotated boxes, two spheres and two capped cylinders. Each room's numbers come
+from its own seed, never from its neighbours in a batch. Source: docs/embedded-model.md, "How the rooms are made".
 """
 
 from __future__ import annotations

@@ -5,22 +5,23 @@
 <root>/<seed>.ply          ground-truth points of all frames, metres
 ```
 
-`<root>` is `<data>/procedural-<domain>`. Source: specification of the embedded model, section 9.
+`<root>` is `<data>/procedural-<domain>`. Source: docs/benchmark.md, "Generated rooms".
 """
 
 from __future__ import annotations
 
 import zipfile
 import zlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from freegeo.data.datasets.base import Protocol, SceneTruth
+from freegeo.data.datasets.base import Dataset, DatasetConstants
 from freegeo.data.procedural.domains import DOMAINS, get_domain
 from freegeo.data.procedural.photographs import RenderedPhoto, photograph_room
-from freegeo.data.scene import Scene
+from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import atomic_path, write_npz
 from freegeo.geometry.depth import depth_to_world, valid_depth
@@ -28,67 +29,67 @@ from freegeo.geometry.depth import depth_to_world, valid_depth
 PREFIX = "procedural-"
 FRAMES = 16
 POINT_SPACING = 0.04
-DEPTH_LIMIT_M = 20.0
-"""Farther than any wall; a prediction with a broken scale would otherwise fill the memory with empty voxels."""
+CONSTANTS = DatasetConstants(
+    voxel=0.04,
+    truncation=0.16,
+    depth_limit=20.0,  # beyond any wall; a broken scale would otherwise fill the memory with empty voxels
+    down_sample=POINT_SPACING,
+    threshold=0.15,
+    truth="points",
+    samples=200_000,
+)
 
 
-class RoomSplit:
-    """One domain of generated rooms with the functions of a dataset module."""
+def room_split(domain: str) -> Dataset:
+    """Return a domain of generated rooms as a dataset; UserError for an unknown domain."""
+    get_domain(domain)
+    return Dataset(
+        name=f"{PREFIX}{domain}",
+        constants=CONSTANTS,
+        scene_names=partial(room_names, domain),
+        load_scene=partial(load_room, domain),
+        recipe_row="procedural",
+        generated=True,
+    )
 
-    def __init__(self, domain: str):
-        self.domain = get_domain(domain)
-        self.PROTOCOL = Protocol(
+
+def room_names(domain: str, root: Path) -> list[str]:
+    """Return the seeds of a domain's rooms, as text; `root` does not matter here."""
+    return [str(seed) for seed in get_domain(domain).seeds()]
+
+
+def load_room(domain: str, root: Path, name: str) -> Scene:
+    """Read a room, rendering it first when its files are not there.
+
+    Raises:
+        UserError: no seed of this domain. FreeGeoError: a file is damaged.
+    """
+    own = get_domain(domain)
+    if not name.isdigit() or int(name) not in own.seeds(own.seed_count):
+        raise UserError(f"{name!r} is no room of the split {domain}; its first is {own.first_seed}.")
+    images, points = Path(root) / f"{name}.npz", Path(root) / f"{name}.ply"
+    if not (images.is_file() and points.is_file()):
+        _render(int(name), domain, images, points)
+    arrays = _read(images)
+    photos = tuple(RenderedPhoto(f"{i:02d}.png", pixels) for i, pixels in enumerate(arrays["photos"]))
+    return Scene(
+        name=name,
+        photos=photos,
+        T_cam_world=torch.from_numpy(arrays["T_cam_world"]),
+        K=torch.from_numpy(arrays["K"]),
+        depth_z=torch.from_numpy(arrays["depth_z"]),
+        truth=SceneTruth(
             dataset=f"{PREFIX}{domain}",
-            voxel=0.04,
-            truncation=0.16,
-            depth_limit=DEPTH_LIMIT_M,
-            down_sample=POINT_SPACING,
-            threshold=0.15,
-            truth="points",
-            samples=200_000,
-        )
-
-    def scene_names(self, root: Path) -> list[str]:
-        """The seeds of the split's rooms, as text; `root` does not matter here."""
-        return [str(seed) for seed in self.domain.seeds()]
-
-    def load_scene(self, root: Path, name: str) -> Scene:
-        """Read a room, rendering it first when its files are not there.
-
-        Raises:
-            UserError: no seed of this split. FreeGeoError: a file is damaged.
-        """
-        if not name.isdigit() or int(name) not in self.domain.seeds(self.domain.seed_count):
-            raise UserError(
-                f"{name!r} is no room of the split {self.domain.name}; its first is {self.domain.first_seed}."
-            )
-        images, points = Path(root) / f"{name}.npz", Path(root) / f"{name}.ply"
-        if not (images.is_file() and points.is_file()):
-            _render(int(name), self.domain.name, images, points)
-        arrays = _read(images)
-        photos = tuple(RenderedPhoto(f"{i:02d}.png", pixels) for i, pixels in enumerate(arrays["photos"]))
-        size_hw = photos[0].size_hw
-        return Scene(
-            name=name,
-            photos=photos,
-            T_cam_world=torch.from_numpy(arrays["T_cam_world"]),
-            K=torch.from_numpy(arrays["K"]),
-            depth_z=torch.from_numpy(arrays["depth_z"]),
-            truth=SceneTruth(
-                dataset=self.PROTOCOL.dataset,
-                surface=points,
-                depth=(None,) * len(photos),
-                mask=(None,) * len(photos),
-                camera_hw=(size_hw,) * len(photos),
-            ),
-        )
-
-    def valid_mask(self, truth: SceneTruth, index: int, size_hw: tuple[int, int]) -> None:
-        """No pixel of a room is masked."""
-        return
+            surface=points,
+            depth=(None,) * len(photos),
+            mask=(None,) * len(photos),
+            camera_hw=(photos[0].size_hw,) * len(photos),
+        ),
+    )
 
 
-SPLITS = {f"{PREFIX}{name}": RoomSplit(name) for name in DOMAINS}
+SPLITS = tuple(room_split(domain) for domain in DOMAINS)
+"""Every domain as a dataset, such as `procedural-light`."""
 
 
 def _render(seed: int, domain: str, images: Path, points: Path) -> None:

@@ -1,7 +1,7 @@
 """Banks of 40 tileable grey textures, stored with their smaller levels as one flat tensor for fast look-up.
 
-Source: specification of the embedded model, section 2 (noise, checker, stripes, dots, cells) and section 9 (bricks and
-rings of the domain `tex`). Every pattern carries some noise of its own, so that no two of its tiles look the same.
+Source: docs/embedded-model.md, "How the rooms are made" (noise, checkers, stripes, dots, cells; bricks and rings in the
+bank of the domain `tex`). Every pattern carries some noise of its own, so that no two of its tiles look the same.
 """
 
 from __future__ import annotations

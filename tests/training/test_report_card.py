@@ -8,17 +8,17 @@ from freegeo.errors import UserError
 from freegeo.geometry.camera import K_from_fov
 from freegeo.training.config import TrainConfig
 from freegeo.training.curve import plot_learning_curve, read_log
-from freegeo.training.evaluate import (
+from freegeo.training.pool import render_rooms
+from freegeo.training.report_card import (
     GATES,
     KEPT,
     MODES,
     card_tables,
-    evaluate,
     report_card,
     score_room,
+    score_rooms,
     zero_motion_rotation_deg,
 )
-from freegeo.training.pool import render_rooms
 from freegeo.training.state import averaged, new_state
 from freegeo.types import Prediction
 
@@ -80,7 +80,7 @@ def test_report_card_has_gates_gaps_and_tables(tmp_path):
 
 def test_evaluation_repeats_itself():
     model = averaged(new_state(TrainConfig()))
-    first, second = (evaluate(model, "val-id", 2, side=48) for _ in range(2))
+    first, second = (score_rooms(model, "val-id", 2, side=48) for _ in range(2))
     assert first.mean("8->4") == second.mean("8->4")
 
 

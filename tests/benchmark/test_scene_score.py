@@ -7,22 +7,19 @@ import pytest
 import torch
 
 from fixture_tools import fixture_path
-from freegeo.benchmark import evaluate
-from freegeo.benchmark.evaluate import (
+from freegeo.benchmark import scene_score
+from freegeo.benchmark.frames import fusion_frames
+from freegeo.benchmark.scene_score import (
     SceneReference,
     load_reference,
-    mean_over_seeds,
-    read_published_prediction,
     score_scene_poses,
     score_scene_surface,
-    select_views,
-    with_mean,
 )
-from freegeo.benchmark.frames import fusion_frames
 from freegeo.data.datasets import registry as datasets
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import UserError
 from freegeo.fusion.mesh import read_mesh
 from freegeo.metrics.cloud import ReferenceCloud
+from parity_benchmark import read_published_prediction, select_views
 
 FOLDER = fixture_path("benchmark")
 
@@ -59,8 +56,8 @@ def test_views_must_be_those_of_the_scene(pipes):
 def test_an_empty_fusion_is_flagged_and_scored_as_published(pipes):
     scene, prediction = pipes
     cloud = ReferenceCloud(np.zeros((1, 3)), down_sample=10.0)
-    rules = replace(datasets.protocol("eth3d"), samples=1000)
-    reference = SceneReference(cloud=cloud, box=(np.zeros(3), np.zeros(3)), protocol=rules)
+    fixed = replace(datasets.constants("eth3d"), samples=1000)
+    reference = SceneReference(cloud=cloud, box=(np.zeros(3), np.zeros(3)), constants=fixed)
     score = score_scene_surface(
         scene, replace(prediction, depth_z=torch.zeros_like(prediction.depth_z)), reference=reference
     )
@@ -77,7 +74,7 @@ def test_prepared_ground_truth_is_kept_until_the_mesh_changes(pipes, tmp_path, m
     fresh = load_reference(scene)
     first = load_reference(scene, cache=tmp_path / "kept")
     reads = []
-    monkeypatch.setattr(evaluate, "read_mesh", lambda path: reads.append(path) or read_mesh(path))
+    monkeypatch.setattr(scene_score, "read_mesh", lambda path: reads.append(path) or read_mesh(path))
     again = load_reference(scene, cache=tmp_path / "kept")
     assert not reads
     for one in (first, again):
@@ -91,33 +88,9 @@ def test_prepared_ground_truth_is_kept_until_the_mesh_changes(pipes, tmp_path, m
 
 
 def test_points_outside_the_grown_box_do_not_count():
-    rules = replace(datasets.protocol("scannetpp"), down_sample=0.0)
+    fixed = replace(datasets.constants("scannetpp"), down_sample=0.0)
     box = (np.zeros(3), np.ones(3))
-    reference = SceneReference(cloud=ReferenceCloud(np.stack(box)), box=box, protocol=rules)
+    reference = SceneReference(cloud=ReferenceCloud(np.stack(box)), box=box, constants=fixed)
     near, far = np.array([[1.05, 1, 1]]), np.array([[9.0, 9, 9]])
     assert reference.score(np.concatenate([near, far])) == reference.score(near)
     assert reference.score(far).fscore == 0
-
-
-def test_means_are_plain():
-    scores = {"a": {"auc03": 0.2}, "b": {"auc03": 0.6}}
-    assert with_mean(scores)["mean"]["auc03"] == pytest.approx(0.4)
-    runs = [with_mean(scores), with_mean({"a": {"auc03": 1.0}})]
-    assert mean_over_seeds(runs)["auc03"] == pytest.approx(0.6)
-    for bad in ({}, {"mean": {"auc03": 1.0}}):
-        with pytest.raises(UserError):
-            with_mean(bad)
-
-
-def test_stored_predictions_may_carry_an_extra_dimension(tmp_path):
-    depth = np.ones((2, 3, 4, 1), np.float32)
-    pose, K = np.tile(np.eye(4, dtype=np.float32)[:3], (2, 1, 1)), np.tile(np.eye(3, dtype=np.float32), (2, 1, 1))
-    np.savez(tmp_path / "a.npz", depth=depth, extrinsics=pose, intrinsics=K)
-    prediction = read_published_prediction(tmp_path / "a.npz")
-    assert prediction.depth_z.shape == (2, 3, 4)
-    assert prediction.T_cam_world.shape == (2, 4, 4)
-    np.savez(tmp_path / "b.npz", depth=depth)
-    with pytest.raises(FreeGeoError, match="readable"):
-        read_published_prediction(tmp_path / "b.npz")
-    with pytest.raises(UserError):
-        read_published_prediction(tmp_path / "missing.npz")

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all; folders are locked, continued, refused and replaced as promised."""
+"""Output folders are locked, continued, refused and replaced as promised."""
 
 import json
 import os
@@ -7,18 +7,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 
 from freegeo import files
 from freegeo import run_folder as run_folders
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import LEDGER_FILE, LOCK_FILE, STATE_FILE, atomic_path, write_json
-from freegeo.run_folder import check_folder, locked, run_folder
+from freegeo.files import LEDGER_FILE, LOCK_FILE, RUN_FILE, write_json
+from freegeo.run_folder import check_folder, difference, locked, run_folder
 
 SETTINGS = {"model": "tiny", "recipe": {"steps": 2, "keep": (0, 2)}, "seed": 1}
-HIDDEN = {STATE_FILE, LOCK_FILE, LEDGER_FILE}
+HIDDEN = {RUN_FILE, LOCK_FILE, LEDGER_FILE}
 
 
 def visible(folder: Path) -> set[str]:
@@ -40,68 +38,6 @@ def child(code: str) -> subprocess.Popen:
     assert process.stdout is not None
     assert process.stdout.readline() == "READY\n"
     return process
-
-
-# -- files
-
-
-def test_file_appears_only_when_it_is_complete(tmp_path):
-    file = tmp_path / "new" / "a.txt"
-    with atomic_path(file) as part:
-        part.write_text("whole")
-        assert part.suffix == ".txt"
-        assert not file.exists()
-    assert file.read_text() == "whole"
-    assert visible(tmp_path) == {"new/a.txt"}
-
-
-def test_failure_inside_the_block_keeps_the_old_file_and_leaves_nothing(tmp_path):
-    file = tmp_path / "a.txt"
-    file.write_text("old")
-    with pytest.raises(KeyboardInterrupt), atomic_path(file) as part:
-        part.write_text("half")
-        raise KeyboardInterrupt
-    assert file.read_text() == "old"
-    assert visible(tmp_path) == {"a.txt"}
-
-
-def test_every_writer_reads_back_and_replaces(tmp_path):
-    for value in (1.0, 2.0):
-        files.write_json(tmp_path / "a.json", {"ö": value})
-        files.write_npz(tmp_path / "a.npz", {"x": np.full(3, value)})
-        files.write_tensors(tmp_path / "a.safetensors", {"x": torch.full((2, 3), value).T}, {"key": "text"})
-    assert files.read_json(tmp_path / "a.json") == {"ö": 2.0}
-    assert (np.load(tmp_path / "a.npz")["x"] == 2).all()
-    from safetensors import safe_open
-
-    with safe_open(tmp_path / "a.safetensors", framework="pt") as file:
-        assert file.metadata() == {"key": "text"}
-        assert torch.equal(file.get_tensor("x"), torch.full((3, 2), 2.0))
-    assert visible(tmp_path) == {"a.json", "a.npz", "a.safetensors"}
-
-
-def test_files_are_readable_by_others_as_the_umask_says(tmp_path):
-    before = os.umask(0o022)
-    try:
-        files.write_tensors(tmp_path / "a.safetensors", {"x": torch.zeros(1)})
-    finally:
-        os.umask(before)
-    assert (tmp_path / "a.safetensors").stat().st_mode & 0o777 == 0o644
-
-
-def test_damaged_json_names_the_file(tmp_path):
-    (tmp_path / "a.json").write_text('{"half": ')
-    with pytest.raises(FreeGeoError, match=r"a\.json: damaged file"):
-        files.read_json(tmp_path / "a.json")
-
-
-def test_folder_that_cannot_be_written_to_is_one_sentence(tmp_path, monkeypatch):
-    def refuse(*args, **options):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "mkdir", refuse)
-    with pytest.raises(UserError, match="cannot be written to"), atomic_path(tmp_path / "x" / "a.txt") as part:
-        part.write_text("never")
 
 
 # -- lock
@@ -150,7 +86,7 @@ def test_new_or_empty_folder_is_started_and_finished(tmp_path, exists):
         folder.mkdir()
     with run_folder(folder, SETTINGS) as run:
         assert not run.finished
-        assert json.loads((folder / STATE_FILE).read_text())["settings"]["recipe"]["keep"] == [0, 2]
+        assert json.loads((folder / RUN_FILE).read_text())["settings"]["recipe"]["keep"] == [0, 2]
         write_json(run / "a.json", 1)
         run.finish()
     with run_folder(folder, SETTINGS) as run:
@@ -183,6 +119,13 @@ def test_other_settings_are_refused_by_name_and_nothing_changes(tmp_path, finish
     assert "keep" not in message and "--overwrite" in message and "\n" not in message
     assert visible(tmp_path) == {"a.json"}
     check_folder(tmp_path, SETTINGS, overwrite=False)
+
+
+def test_differences_are_named_with_their_place():
+    before, now = {"recipe": {"lr": 1, "rank": 4}, "model": "a"}, {"recipe": {"lr": 2, "rank": 4}, "model": "a"}
+    assert difference(before, now) == "recipe.lr: 1 there, 2 now"
+    assert difference({"adaptation": None}, {"adaptation": {"per": "scene"}}) == "adaptation: none there, given now"
+    assert difference(now, now) == ""
 
 
 def test_many_differences_are_cut_short(tmp_path):
@@ -239,7 +182,7 @@ def test_result_inside_another_result_is_a_result_of_its_own(tmp_path):
     result(tmp_path / "inner")
     with run_folder(tmp_path, {}, overwrite=True):
         assert visible(tmp_path) == {"inner/result.json", "inner/deep/part.json"} | {
-            f"inner/{name}" for name in (STATE_FILE, LEDGER_FILE)
+            f"inner/{name}" for name in (RUN_FILE, LEDGER_FILE)
         }
 
 
@@ -311,8 +254,8 @@ def test_folder_without_write_permission(tmp_path, monkeypatch):
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_newer_format_is_left_alone(tmp_path, overwrite):
     result(tmp_path)
-    state = json.loads((tmp_path / STATE_FILE).read_text())
-    (tmp_path / STATE_FILE).write_text(json.dumps({**state, "format": files.FORMAT + 1}))
+    state = json.loads((tmp_path / RUN_FILE).read_text())
+    (tmp_path / RUN_FILE).write_text(json.dumps({**state, "format": files.FORMAT + 1}))
     with pytest.raises(UserError, match="newer freegeo"), run_folder(tmp_path, SETTINGS, overwrite=overwrite):
         pass
     assert visible(tmp_path) == {"result.json", "deep/part.json"}
@@ -320,8 +263,8 @@ def test_newer_format_is_left_alone(tmp_path, overwrite):
 
 @pytest.mark.parametrize("text", ["[1]", "{}", "not json"])
 def test_damaged_state_is_an_error_with_the_files_name(tmp_path, text):
-    (tmp_path / STATE_FILE).write_text(text)
-    with pytest.raises(FreeGeoError, match=STATE_FILE), run_folder(tmp_path, SETTINGS):
+    (tmp_path / RUN_FILE).write_text(text)
+    with pytest.raises(FreeGeoError, match=RUN_FILE), run_folder(tmp_path, SETTINGS):
         pass
 
 
@@ -344,12 +287,3 @@ with run_folder(Path({str(tmp_path)!r}), {{"a": 1}}) as run:
     with run_folder(tmp_path, {"a": 1}) as run:
         assert not run.finished
         assert visible(tmp_path) == {"deep/a.json"}
-
-
-def test_a_full_disk_names_the_file_that_was_asked_for(tmp_path):
-    path = tmp_path / "result.json"
-    with pytest.raises(OSError, match="No space left") as caught, atomic_path(path) as part:
-        part.write_text("half")
-        raise OSError(28, "No space left on device")
-    assert caught.value.filename == str(path)
-    assert list(tmp_path.iterdir()) == []
