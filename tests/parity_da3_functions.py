@@ -16,7 +16,8 @@ from freegeo.geometry.camera import decode_camera_to_world, encode_camera_to_wor
 from freegeo.geometry.rays import cameras_from_rays
 from freegeo.geometry.se3 import inverse, normalise_poses, to_4x4
 from freegeo.models import reference
-from freegeo.models.da3 import Backbone, DA3Config
+from freegeo.models.da3 import Backbone
+from freegeo.models.da3_config import DA3Config
 from freegeo.models.da3_images import apply_plan, plan_size, preprocess
 from freegeo.models.dpt import uv_embedding
 from freegeo.models.images import normalise

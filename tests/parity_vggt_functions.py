@@ -17,8 +17,8 @@ from freegeo.geometry.camera import decode_world_to_camera, encode_world_to_came
 from freegeo.geometry.depth import depth_to_world, unproject, valid_depth
 from freegeo.geometry.rotation import matrix_to_quat_xyzw, quat_xyzw_to_matrix
 from freegeo.geometry.se3 import inverse, to_4x4
-from freegeo.models.checkpoints import KeyRules
 from freegeo.models.dpt import depth_maps, uv_embedding
+from freegeo.models.spec import KeyRules
 from freegeo.models.transformer import position_table, rope_table, rotate
 from freegeo.models.vggt import CameraHead, point_map
 from freegeo.models.vggt_images import plan_size, preprocess

@@ -1,4 +1,4 @@
-"""VGGT reproduces recorded numbers; its presets, limits and ways to read photos are as described."""
+"""VGGT reproduces recorded numbers; its variants, limits and ways to read photos are as described."""
 
 import sys
 from collections.abc import Callable
@@ -15,7 +15,8 @@ sys.path.append(str(TESTS))  # parity_vggt.py is shared with the full parity run
 from freegeo.data.photos import load_photos  # noqa: E402
 from freegeo.errors import UserError  # noqa: E402
 from freegeo.models.catalog import build_empty  # noqa: E402
-from freegeo.models.vggt import CameraHead, VGGTConfig  # noqa: E402
+from freegeo.models.vggt import CameraHead  # noqa: E402
+from freegeo.models.vggt_config import VGGTConfig  # noqa: E402
 from freegeo.models.vggt_images import apply_plan, plan_size, preprocess  # noqa: E402
 from freegeo.types import Cameras  # noqa: E402
 from parity_vggt import build, cases  # noqa: E402
@@ -58,7 +59,7 @@ def test_trainable_values_at_rank_32():
     assert lora + model.get_parameter(model.camera_token_name).numel() == 25_167_872
 
 
-def test_both_presets_share_the_architecture_and_differ_in_the_licence():
+def test_both_variants_share_the_architecture_and_differ_in_the_licence():
     free, commercial = build_empty("vggt-1b"), build_empty("vggt-1b-commercial")
     assert free.config == commercial.config
     assert "non-commercial" in free.spec.weights_licence

@@ -26,7 +26,7 @@ import torch
 from freegeo.benchmark import sampling
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import read_json, write_json
-from freegeo.models.api import AdaptationDefaults
+from freegeo.models.spec import AdaptationDefaults
 
 logger = logging.getLogger(__name__)
 
