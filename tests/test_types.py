@@ -1,8 +1,9 @@
-"""The values that cross room borders: chosen, joined, written down and read back without loss."""
+"""The values that packages hand to each other: chosen, joined, written down and read back without loss."""
 
 import pytest
 import torch
 
+from freegeo.geometry.camera import photo_K
 from freegeo.types import Features, ImageBatch, Prediction, ViewTokens
 
 VIEWS = 5
@@ -46,8 +47,8 @@ def test_intrinsics_go_to_the_photo_and_back():
     K = torch.eye(3, dtype=torch.float64).repeat(VIEWS, 1, 1) * 50
     K[:, :2, 2], K[:, 2, 2] = 5.0, 1.0
     before = K.clone()
-    assert torch.allclose(images.model_K(images.photo_K(K)), K)
-    assert torch.allclose(images.photo_K(images.model_K(K)), K)
+    assert torch.allclose(images.model_K(photo_K(K, images.scale_xy, images.offset_xy)), K)
+    assert torch.allclose(photo_K(images.model_K(K), images.scale_xy, images.offset_xy), K)
     assert torch.equal(K, before)
 
 

@@ -72,18 +72,13 @@ class ImageBatch:
         """Return a fingerprint of the pixels, which tells photos of the same names apart."""
         return hashlib.sha256(self.images.contiguous().numpy().tobytes()).hexdigest()[:16]
 
-    def photo_K(self, K: Tensor) -> Tensor:
-        """Turn intrinsics (S, 3, 3) of the model's images into those of the original photos."""
-        return self._move_K(K, 1 / self.scale_xy.to(K), -self.offset_xy.to(K) / self.scale_xy.to(K))
-
     def model_K(self, K: Tensor) -> Tensor:
-        """Turn intrinsics (S, 3, 3) of the original photos into those of the model's images."""
-        return self._move_K(K, self.scale_xy.to(K), self.offset_xy.to(K))
+        """Turn intrinsics (S, 3, 3) of the original photos into those of the model's images.
 
-    @staticmethod
-    def _move_K(K: Tensor, scale_xy: Tensor, offset_xy: Tensor) -> Tensor:
-        rows = K[:, :2] * scale_xy[:, :, None]
-        rows[:, :, 2] += offset_xy
+        `freegeo.geometry.camera.photo_K` is the way back.
+        """
+        rows = K[:, :2] * self.scale_xy.to(K)[:, :, None]
+        rows[:, :, 2] += self.offset_xy.to(K)
         return torch.cat([rows, K[:, 2:]], dim=1)
 
 

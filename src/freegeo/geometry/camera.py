@@ -18,12 +18,11 @@ from freegeo.geometry.se3 import from_Rt, inverse
 __all__ = [
     "K_from_focal",
     "K_from_fov",
-    "crop_K",
     "decode_camera_to_world",
     "decode_world_to_camera",
     "encode_camera_to_world",
-    "encode_world_to_camera",
     "fov_from_K",
+    "photo_K",
     "pixel_grid",
     "project",
     "resize_K",
@@ -72,9 +71,14 @@ def resize_K(K: Tensor, from_hw: tuple[int, int], to_hw: tuple[int, int]) -> Ten
     return K * ratios[:, None]
 
 
-def crop_K(K: Tensor, *, top: float, left: float) -> Tensor:
-    """``K`` (..., 3, 3) after removing ``top`` rows and ``left`` columns of the image (negative: padding)."""
-    return K - K.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+def photo_K(K: Tensor, scale_xy: Tensor, offset_xy: Tensor) -> Tensor:
+    """``K`` (..., 3, 3) of photos from that of a model's images, where a photo's pixel u is at ``u * scale + offset``.
+
+    ``scale_xy`` and ``offset_xy`` are (..., 2), x first. The offset is negative where a photo was cropped and positive
+    where it was padded; `ImageBatch` carries both. The principal point moves as any other place of the image.
+    """
+    rows = torch.cat((K[..., :2, :2], K[..., :2, 2:] - offset_xy[..., None]), dim=-1) / scale_xy[..., None]
+    return torch.cat((rows, K[..., 2:, :]), dim=-2)
 
 
 def pixel_grid(image_hw: tuple[int, int], *, like: Tensor) -> Tensor:
@@ -110,7 +114,9 @@ def decode_camera_to_world(encoding: Tensor, image_hw: tuple[int, int]) -> tuple
 
 def encode_camera_to_world(T_cam_world: Tensor, K: Tensor, image_hw: tuple[int, int]) -> Tensor:
     """Cameras as DA3's nine camera-to-world numbers (..., 9); the principal point is ignored (``specs/da3.md`` 8)."""
-    return _encode(inverse(T_cam_world), K, image_hw)
+    T_world_cam = inverse(T_cam_world)
+    fov = torch.stack(fov_from_K(K, image_hw), dim=-1)
+    return torch.cat((T_world_cam[..., :3, 3], matrix_to_quat_xyzw(T_world_cam[..., :3, :3]), fov), dim=-1)
 
 
 def decode_world_to_camera(encoding: Tensor, image_hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -121,18 +127,8 @@ def decode_world_to_camera(encoding: Tensor, image_hw: tuple[int, int]) -> tuple
     return _decode(encoding, image_hw)
 
 
-def encode_world_to_camera(T_cam_world: Tensor, K: Tensor, image_hw: tuple[int, int]) -> Tensor:
-    """Cameras as VGGT's nine world-to-camera numbers (..., 9); the principal point is ignored."""
-    return _encode(T_cam_world, K, image_hw)
-
-
 def _decode(encoding: Tensor, image_hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
     if encoding.shape[-1] != 9:
         raise UserError(f"A pose encoding has 9 numbers, got shape {tuple(encoding.shape)}.")
     transform = from_Rt(quat_xyzw_to_matrix(encoding[..., 3:7]), encoding[..., :3])
     return transform, K_from_fov(encoding[..., 7], encoding[..., 8], image_hw)
-
-
-def _encode(transform: Tensor, K: Tensor, image_hw: tuple[int, int]) -> Tensor:
-    fov = torch.stack(fov_from_K(K, image_hw), dim=-1)
-    return torch.cat((transform[..., :3, 3], matrix_to_quat_xyzw(transform[..., :3, :3]), fov), dim=-1)

@@ -208,7 +208,7 @@ class DA3(ReconstructionModel):
         ]
 
     def preprocess(self, photos: Sequence) -> ImageBatch:
-        """Resize as the reference does: longest side, then the nearest multiple of the patch (spec section 11)."""
+        """Resize to the default longest side, then to the nearest multiples of the patch."""
         return da3_images.preprocess(photos, side=self.spec.default_side, patch=self.config.patch_size)
 
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:

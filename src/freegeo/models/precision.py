@@ -1,4 +1,4 @@
-"""Which arithmetic a model runs in: float32, or autocast to bfloat16 or float16 with float32 heads and norms."""
+"""The device and precision a model runs in: float32, or autocast to a half type with float32 heads and norms."""
 
 from __future__ import annotations
 
@@ -16,10 +16,8 @@ if TYPE_CHECKING:
 
 Precision = Literal["fp32", "bf16", "fp16"]
 PRECISIONS: tuple[Precision, ...] = ("fp32", "bf16", "fp16")
-_DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
-
-
 CPU = torch.device("cpu")
+_DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,15 +27,15 @@ class Compute:
     device: torch.device = CPU
     precision: Precision = "fp32"
 
+    @classmethod
+    def choose(cls, device: str | None = None, precision: str | None = None) -> Compute:
+        """Return the device and precision asked for, or the best at hand; UserError when they are not there."""
+        chosen = choose_device(device)
+        return cls(device=chosen, precision=choose_precision(precision, chosen))
+
     def autocast(self) -> AbstractContextManager:
         """Return the context that a model's embed and aggregate run in."""
         return autocast(self.device, self.precision)
-
-    @classmethod
-    def choose(cls, device: str | None, precision: str | None) -> Compute:
-        """Return the device and precision asked for, or the best at hand."""
-        chosen = choose_device(device)
-        return cls(device=chosen, precision=choose_precision(precision, chosen))
 
 
 def choose_device(name: str | None) -> torch.device:

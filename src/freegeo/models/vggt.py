@@ -194,11 +194,9 @@ class VGGT(ReconstructionModel):
             for name in block_linears(f"aggregator.{kind}.{i}", block)
         ]
 
-    def preprocess(self, photos: Sequence, *, mode: vggt_images.Mode = "longest") -> ImageBatch:
-        """Resize to the default longest side with the aspect kept, or to the training side in another mode."""
-        trained = self.config.position_grid * self.config.patch_size
-        side = self.spec.default_side if mode == "longest" else trained
-        return vggt_images.preprocess(photos, mode=mode, side=side, patch=self.config.patch_size)
+    def preprocess(self, photos: Sequence) -> ImageBatch:
+        """Resize to the default longest side, the aspect kept up to whole patches, as in the benchmark."""
+        return vggt_images.preprocess(photos, side=self.spec.default_side, patch=self.config.patch_size)
 
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:
         """Run the patch encoder on images (B, S, 3, H, W) in [0, 1].
