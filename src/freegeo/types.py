@@ -1,4 +1,4 @@
-"""The values that cross room borders: image batches, view tokens, features, predictions.
+"""The values that packages hand to each other: image batches, view tokens, features, predictions.
 
 Letters: B batch, S views, H W pixels, P patches, N tokens, T special tokens, C channels.
 """
@@ -40,7 +40,7 @@ class ImageBatch:
     """Photos at the size a model reads them, with the way back to the photos' own pixels.
 
     A photo pixel `u` appears in the model image at `u * scale + offset` (per axis, x first); principal points
-    move by the same rule, as the benchmark protocol scales them.
+    move by the same rule (docs/conventions.md, "From model pixels to the photo").
     """
 
     images: Tensor

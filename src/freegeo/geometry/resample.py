@@ -39,7 +39,7 @@ def resize_area(image: Tensor, size: tuple[int, int]) -> Tensor:
     """Shrink an 8-bit image by exact area averaging, as OpenCV's ``INTER_AREA``.
 
     Each output pixel is the mean of the input it covers, partly covered pixels counting by their covered fraction.
-    Source: the rule of DA3 (``specs/da3.md`` section 11) and VGGT (``specs/vggt.md`` section 14).
+    Source: the rule of DA3 (docs/models/da3.md, "Images") and VGGT (docs/models/vggt.md, "Images").
 
     Args:
         image: (H, W, C) uint8.
@@ -89,8 +89,8 @@ def resize_cubic(image: Tensor, size: tuple[int, int]) -> Tensor:
 def resize_nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
     """Nearest-neighbour resize of maps (..., H, W) of any dtype to (..., height, width).
 
-    The source index is ``floor(i * source / target)``, clamped (``specs/benchmark.md`` section 6 step 2), which is
-    OpenCV's ``INTER_NEAREST``: the first pixel maps to the first pixel and no half-pixel centre is involved.
+    The source index is ``floor(i * source / target)``, clamped, which is OpenCV's ``INTER_NEAREST``: the first pixel
+    maps to the first pixel and no half-pixel centre is involved (docs/benchmark.md, "Fusion and scoring").
 
     Raises:
         UserError: the size is not positive.

@@ -32,8 +32,7 @@ def quat_xyzw_to_wxyz(quat_xyzw: Tensor) -> Tensor:
 def quat_xyzw_to_matrix(quat_xyzw: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4), which need not have unit length.
 
-    The length is divided out (``specs/da3.md`` section 7, ``specs/vggt.md`` section 11). The zero quaternion is no
-    rotation and gives NaN.
+    The length is divided out (docs/models/da3.md, "Camera decoder"). The zero quaternion is no rotation and gives NaN.
     """
     x, y, z, w = quat_xyzw.unbind(-1)
     n = 2.0 / quat_xyzw.square().sum(-1)
@@ -49,8 +48,8 @@ def matrix_to_quat_xyzw(matrix: Tensor) -> Tensor:
     """Quaternions (..., 4), scalar last and ``w >= 0``, of rotation matrices (..., 3, 3).
 
     Of the four magnitudes of w, x, y, z the largest (first on ties) is taken and the others follow from it, which is
-    accurate for every rotation, half turns included (``specs/da3.md`` section 8.2). The result is not renormalised: a
-    matrix that is not quite a rotation gives a quaternion that is not quite of unit length.
+    accurate for every rotation, half turns included (docs/models/da3.md, "Known cameras"). The result is not
+    renormalised: a matrix that is not quite a rotation gives a quaternion that is not quite of unit length.
     """
     (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = (row.unbind(-1) for row in matrix.unbind(-2))
     squares = torch.stack((m00 + m11 + m22, m00 - m11 - m22, m11 - m00 - m22, m22 - m00 - m11), dim=-1) + 1

@@ -1,4 +1,4 @@
-"""Depth Anything 3, any-view models (spec: DA3 fact sheet, sections 1 to 8).
+"""Depth Anything 3, any-view models (docs/models/da3.md, "Stages" and what follows); variants are in da3_config.py.
 
 Per-view blocks, then alternating per-view and global blocks; a dual dense head for depth and rays; a camera decoder,
 and a camera encoder for known poses. Modules carry the official key names without the prefix `model.`.

@@ -1,7 +1,9 @@
-"""The one dense head (DPT) of every model here (specs of DA3 section 6, VGGT section 9).
+"""The one dense head (DPT) of every model here.
 
 Four feature levels become a pyramid, are fused from coarse to fine and read out at image resolution. Letters:
 V views (batch and views flattened), P patches, C channels in, F head features, `grid` (h, w) in patches.
+
+Sources: docs/models/da3.md, "Dense head", and docs/models/vggt.md, "Dense heads".
 """
 
 from __future__ import annotations

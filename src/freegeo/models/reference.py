@@ -1,4 +1,4 @@
-"""Which view the others are described in: the rules of DA3's fact sheet, section 5."""
+"""Which view the others are described in: the rules of docs/models/da3.md, "Reference view"."""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
-"""The one ViT block of every model here, with the two-axis RoPE (specs of DA3 section 4, VGGT sections 6 and 7).
+"""The one ViT block of every model here, with the two-axis RoPE.
 
 Letters: B batch (views or scenes), L tokens in one attention, N tokens of one view, H heads, d head width, D width.
+
+Sources: docs/models/da3.md, "Backbone"; docs/models/da3.md, "Rotary positions"; docs/models/vggt.md, "Blocks".
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""VGGT (spec: VGGT fact sheet, sections 3 to 11).
+"""VGGT (docs/models/vggt.md, "Stages" and what follows); its sizes are in vggt_config.py.
 
 A DINOv2 encoder reads each view alone; 24 pairs of blocks then attend within each view (frame) and across all views
 (global); a camera head refines nine numbers per view over four steps, and two dense heads read depth and world points.
