@@ -106,12 +106,11 @@ class ViewTokens:
     @classmethod
     def join_views(cls, parts: Sequence[ViewTokens]) -> ViewTokens:
         """Put the views of several parts behind each other; all parts have the same image size."""
-        return _concatenate(parts, dim=1)
-
-    @classmethod
-    def stack(cls, samples: Sequence[ViewTokens]) -> ViewTokens:
-        """Put several samples into one batch; all have the same views and image size."""
-        return _concatenate(samples, dim=0)
+        first = parts[0]
+        if any(p.image_hw != first.image_hw for p in parts):
+            raise ValueError(f"view tokens of different image sizes cannot be joined: {[p.image_hw for p in parts]}")
+        extra = {name: torch.cat([p.extra[name] for p in parts], dim=1) for name in first.extra}
+        return replace(first, tokens=torch.cat([p.tokens for p in parts], dim=1), extra=extra)
 
     def to(self, *args, **kwargs) -> Self:
         """Move or cast all tensors, with the arguments of `Tensor.to`."""
@@ -129,14 +128,6 @@ class ViewTokens:
         return cls(tokens=tensors["tokens"], extra=extra, **_read_meta(tensors))
 
 
-def _concatenate(parts: Sequence[ViewTokens], dim: int) -> ViewTokens:
-    first = parts[0]
-    if any(p.image_hw != first.image_hw for p in parts):
-        raise ValueError(f"view tokens of different image sizes cannot be joined: {[p.image_hw for p in parts]}")
-    extra = {name: torch.cat([p.extra[name] for p in parts], dim) for name in first.extra}
-    return replace(first, tokens=torch.cat([p.tokens for p in parts], dim), extra=extra)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Features:
     """What the decoder reads: per layer the patch tokens and the special tokens of every view, in input order."""
@@ -149,15 +140,6 @@ class Features:
     def select(self, views: Sequence[int]) -> Self:
         """Return the chosen views, in the order given ("8->4" is `select([0, 2, 4, 6])`)."""
         return self._map(lambda t: t.index_select(1, torch.as_tensor(list(views), dtype=torch.long, device=t.device)))
-
-    @classmethod
-    def stack(cls, samples: Sequence[Features]) -> Features:
-        """Put several samples into one batch."""
-        levels = {
-            layer: tuple(torch.cat([s.levels[layer][k] for s in samples]) for k in (0, 1))
-            for layer in samples[0].levels
-        }
-        return replace(samples[0], levels=levels)
 
     def to(self, *args, **kwargs) -> Self:
         """Move or cast all tensors, with the arguments of `Tensor.to`."""

@@ -27,18 +27,16 @@ FINAL_NORM = "backbone.pretrained.norm.weight"
 @pytest.fixture(autouse=True)
 def small_models(monkeypatch):
     """Put the two small models into the catalog, under the rules of the official files."""
-    small = (
-        ModelEntry(
-            name="small-da3", about="", licence="none", parameters=0, keys=da3_config.KEYS,
-            build=lambda: parity_da3.empty_model(DA3),
-        ),
-        ModelEntry(
-            name="small-vggt", about="", licence="none", parameters=0, keys=vggt_config.KEYS,
-            build=lambda: parity_vggt.empty_model(VGGT),
-        ),
+    small_da3 = ModelEntry(
+        name="small-da3", about="", licence="none", parameters=0, keys=da3_config.KEYS,
+        build=lambda: parity_da3.empty_model(DA3),
     )  # fmt: skip
-    own = {**catalog._own_entries(), **{item.name: item for item in small}}
-    monkeypatch.setattr(catalog, "_own_entries", lambda: own)
+    small_vggt = ModelEntry(
+        name="small-vggt", about="", licence="none", parameters=0, keys=vggt_config.KEYS,
+        build=lambda: parity_vggt.empty_model(VGGT),
+    )  # fmt: skip
+    monkeypatch.setattr(da3_config, "ENTRIES", (*da3_config.ENTRIES, small_da3))
+    monkeypatch.setattr(vggt_config, "ENTRIES", (*vggt_config.ENTRIES, small_vggt))
 
 
 def load(name: str, path: Path):

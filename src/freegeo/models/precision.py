@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
-from torch import nn
 
 from freegeo.errors import UserError
-
-if TYPE_CHECKING:
-    from freegeo.models.api import ReconstructionModel
 
 Precision = Literal["fp32", "bf16", "fp16"]
 PRECISIONS: tuple[Precision, ...] = ("fp32", "bf16", "fp16")
@@ -69,31 +65,3 @@ def choose_precision(name: str | None, device: torch.device) -> Precision:
 def autocast(device: torch.device, precision: Precision) -> AbstractContextManager:
     """Return the context that a model's embed and aggregate run in."""
     return nullcontext() if precision == "fp32" else torch.autocast(device.type, _DTYPES[precision])
-
-
-def cast_linears(model: ReconstructionModel, precision: Precision) -> None:
-    """Store the encoder's frozen linear weights in the half precision that autocast rounds them to.
-
-    Results under `autocast` stay the same to the bit and the weights take half the room. Norms, LayerScale, tokens,
-    trained parameters and everything outside the encoder (the heads) keep float32. Rounding is for good: reload the
-    model for float32 results, and run this one under `autocast`. Nothing happens for `fp32`.
-    """
-    if precision == "fp32":
-        return
-    for module in encoder(model).modules():
-        if isinstance(module, nn.Linear):
-            for parameter in module.parameters(recurse=False):
-                if not parameter.requires_grad:
-                    parameter.data = parameter.data.to(_DTYPES[precision])
-
-
-def encoder(model: ReconstructionModel) -> nn.Module:
-    """Return the innermost module that holds everything an adapter touches: `embed` and `aggregate`, but no head."""
-    names = [*model.adapter_targets(), *([model.camera_token_name] if model.camera_token_name else [])]
-    paths = [name.split(".")[:-1] for name in names]
-    common = []
-    for parts in zip(*paths, strict=False):
-        if len(set(parts)) > 1:
-            break
-        common.append(parts[0])
-    return model.get_submodule(".".join(common))
