@@ -182,7 +182,7 @@ class Cameras:
     """(..., S, 3, 3), pixels of the images they travel with."""
 
     def to(self, device: torch.device | str) -> Self:
-        """Return the cameras on a device."""
+        """Move both tensors to a device."""
         return replace(self, T_cam_world=self.T_cam_world.to(device), K=self.K.to(device))
 
 

@@ -3,10 +3,12 @@
 import logging
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from torch import nn
 
 TESTS = Path(__file__).parents[1]
 sys.path.append(str(TESTS))  # the parity modules are shared with the full parity run and lie beside this folder
@@ -183,6 +185,15 @@ def test_folder_stands_for_its_weight_file(tmp_path):
     assert find_file(tmp_path).name == "model.safetensors"
     with pytest.raises(UserError, match="no such checkpoint"):
         find_file(tmp_path / "nowhere")
+
+
+def test_a_family_of_models_is_added_by_naming_its_module(monkeypatch):
+    family = ModuleType("family")
+    family.ENTRIES = (ModelEntry(name="new", about="", licence="none", parameters=0, build=nn.Identity),)
+    monkeypatch.setitem(sys.modules, "family", family)
+    monkeypatch.setattr(catalog, "FAMILIES", (*catalog.FAMILIES, "family"))
+    assert "new" in catalog.names()
+    assert isinstance(catalog.build_empty("new"), nn.Identity)
 
 
 def test_unknown_names_list_the_known_ones():

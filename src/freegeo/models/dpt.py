@@ -70,7 +70,7 @@ class ResidualUnit(nn.Module):
 
 
 class Fusion(nn.Module):
-    """One step from coarse to fine."""
+    """One step from a coarse map to the next finer size, with that level's map (the lateral one) added."""
 
     def __init__(self, features: int, *, lateral: bool, rectified_skip: bool):
         super().__init__()
@@ -95,7 +95,7 @@ class Permute(nn.Module):
         self.order = order
 
     def forward(self, x: Tensor) -> Tensor:
-        """Permute the axes."""
+        """Return a view of x with its axes in the order of the constructor."""
         return x.permute(self.order)
 
 
