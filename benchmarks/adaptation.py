@@ -68,7 +68,8 @@ def build_model(name: str):
     if name == "vggt-small-shape":
         from dataclasses import replace
 
-        from freegeo.models.vggt import VGGT, VGGTConfig
+        from freegeo.models.vggt import VGGT
+        from freegeo.models.vggt_config import VGGTConfig
 
         config = VGGTConfig(
             width=384, depth=6, heads=6, encoder_depth=6, encoder_heads=6, camera_depth=1, camera_heads=6,

@@ -15,12 +15,13 @@ from torch import Tensor
 
 from fixture_tools import relative_error
 from freegeo.geometry.se3 import to_4x4
-from freegeo.models import da3_presets, reference
-from freegeo.models.api import AdaptationDefaults, ModelSpec
+from freegeo.models import reference
 from freegeo.models.catalog import build_empty
 from freegeo.models.checkpoints import build_on_meta, load_weights
-from freegeo.models.da3 import DA3, DA3Config
+from freegeo.models.da3 import DA3
+from freegeo.models.da3_config import KEYS, DA3Config
 from freegeo.models.images import IMAGE_MEAN, IMAGE_STD
+from freegeo.models.spec import AdaptationDefaults, ModelSpec
 from freegeo.types import Cameras, Features, Prediction, ViewTokens
 from parity_da3_functions import FUNCTIONS
 
@@ -50,7 +51,7 @@ def cases(folder: Path) -> Iterator[tuple[str, Check]]:
 def build(folder: Path) -> DA3:
     """Build and load the small model of a fixture folder."""
     model = build_on_meta(lambda: empty_model(folder))
-    load_weights(model, folder / "weights.safetensors", da3_presets.keys(), folder.name)
+    load_weights(model, folder / "weights.safetensors", KEYS, folder.name)
     return model.eval()
 
 
@@ -138,7 +139,7 @@ def check_keys(preset: str, path: Path) -> float:
     """Compare names and shapes of a preset built on the meta device with a stored list."""
     listed = json.loads(path.read_text())
     wanted = {name: tuple(shape) for name, shape in listed["shapes"].items()}
-    aliases = da3_presets.keys().aliases
+    aliases = KEYS.aliases
     state = build_empty(preset).state_dict()
     ours = {f"model.{name}": tuple(value.shape) for name, value in state.items() if name not in aliases}
     wanted = {name: shape for name, shape in wanted.items() if not name.startswith("model.gs_head.")}

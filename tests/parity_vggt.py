@@ -15,11 +15,11 @@ from torch import Tensor
 
 from fixture_tools import relative_error
 from freegeo.geometry.depth import depth_to_world
-from freegeo.models import vggt_presets
-from freegeo.models.api import AdaptationDefaults, ModelSpec
 from freegeo.models.catalog import build_empty
 from freegeo.models.checkpoints import build_on_meta, load_weights
-from freegeo.models.vggt import VGGT, VGGTConfig
+from freegeo.models.spec import AdaptationDefaults, ModelSpec
+from freegeo.models.vggt import VGGT
+from freegeo.models.vggt_config import KEYS, VGGTConfig
 from freegeo.types import Features, Prediction, ViewTokens
 from parity_vggt_functions import FUNCTIONS
 
@@ -52,7 +52,7 @@ def cases(folder: Path) -> Iterator[tuple[str, Check]]:
 def build(folder: Path) -> VGGT:
     """Build and load the small model of a fixture folder."""
     model = build_on_meta(lambda: empty_model(folder))
-    load_weights(model, folder / "weights.safetensors", vggt_presets.keys(), folder.name)
+    load_weights(model, folder / "weights.safetensors", KEYS, folder.name)
     return model.eval()
 
 

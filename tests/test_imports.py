@@ -44,9 +44,13 @@ def call(*arguments: str) -> str:
     [
         pytest.param("import freegeo; dir(freegeo); freegeo.__version__", id="import freegeo"),
         pytest.param("import freegeo.cli.app", id="import freegeo.cli.app"),
+        pytest.param("import freegeo.run_folder, freegeo.errors", id="import run folders"),
         pytest.param(
-            "import freegeo.run_folder, freegeo.errors, freegeo.models.catalog, freegeo.adaptation.recipe",
-            id="import light rooms",
+            "import freegeo.models.spec, freegeo.models.catalog, freegeo.adaptation.recipe",
+            id="import specs and recipes",
+        ),
+        pytest.param(
+            "from freegeo.models import catalog\nfor name in catalog.names(): catalog.entry(name)", id="look models up"
         ),
         pytest.param(call("--help"), id="freegeo --help"),
         pytest.param(call("--version"), id="freegeo --version"),

@@ -6,9 +6,12 @@ from torch import Tensor, nn
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.recipe import Recipe, scene
 from freegeo.adaptation.samples import SceneImages
-from freegeo.models.api import AdaptationDefaults, ModelSpec, ReconstructionModel
-from freegeo.models.da3 import DA3, DA3Config
-from freegeo.models.vggt import VGGT, VGGTConfig
+from freegeo.models.api import ReconstructionModel
+from freegeo.models.da3 import DA3
+from freegeo.models.da3_config import DA3Config
+from freegeo.models.spec import AdaptationDefaults, ModelSpec
+from freegeo.models.vggt import VGGT
+from freegeo.models.vggt_config import VGGTConfig
 
 PATCH = 8
 DEFAULTS = AdaptationDefaults(temperature=1.0, scene_lr=3e-3, rank=4)

@@ -1,4 +1,4 @@
-"""The values that cross room borders: image batches, view tokens, features, predictions.
+"""The values that packages hand to each other: image batches, view tokens, features, predictions.
 
 Letters: B batch, S views, H W pixels, P patches, N tokens, T special tokens, C channels.
 """
@@ -40,7 +40,7 @@ class ImageBatch:
     """Photos at the size a model reads them, with the way back to the photos' own pixels.
 
     A photo pixel `u` appears in the model image at `u * scale + offset` (per axis, x first); principal points
-    move by the same rule, as the benchmark protocol scales them.
+    move by the same rule (docs/conventions.md, "From model pixels to the photo").
     """
 
     images: Tensor
@@ -72,18 +72,13 @@ class ImageBatch:
         """Return a fingerprint of the pixels, which tells photos of the same names apart."""
         return hashlib.sha256(self.images.contiguous().numpy().tobytes()).hexdigest()[:16]
 
-    def photo_K(self, K: Tensor) -> Tensor:
-        """Turn intrinsics (S, 3, 3) of the model's images into those of the original photos."""
-        return self._move_K(K, 1 / self.scale_xy.to(K), -self.offset_xy.to(K) / self.scale_xy.to(K))
-
     def model_K(self, K: Tensor) -> Tensor:
-        """Turn intrinsics (S, 3, 3) of the original photos into those of the model's images."""
-        return self._move_K(K, self.scale_xy.to(K), self.offset_xy.to(K))
+        """Turn intrinsics (S, 3, 3) of the original photos into those of the model's images.
 
-    @staticmethod
-    def _move_K(K: Tensor, scale_xy: Tensor, offset_xy: Tensor) -> Tensor:
-        rows = K[:, :2] * scale_xy[:, :, None]
-        rows[:, :, 2] += offset_xy
+        `freegeo.geometry.camera.photo_K` is the way back.
+        """
+        rows = K[:, :2] * self.scale_xy.to(K)[:, :, None]
+        rows[:, :, 2] += self.offset_xy.to(K)
         return torch.cat([rows, K[:, 2:]], dim=1)
 
 
@@ -111,12 +106,11 @@ class ViewTokens:
     @classmethod
     def join_views(cls, parts: Sequence[ViewTokens]) -> ViewTokens:
         """Put the views of several parts behind each other; all parts have the same image size."""
-        return _concatenate(parts, dim=1)
-
-    @classmethod
-    def stack(cls, samples: Sequence[ViewTokens]) -> ViewTokens:
-        """Put several samples into one batch; all have the same views and image size."""
-        return _concatenate(samples, dim=0)
+        first = parts[0]
+        if any(p.image_hw != first.image_hw for p in parts):
+            raise ValueError(f"view tokens of different image sizes cannot be joined: {[p.image_hw for p in parts]}")
+        extra = {name: torch.cat([p.extra[name] for p in parts], dim=1) for name in first.extra}
+        return replace(first, tokens=torch.cat([p.tokens for p in parts], dim=1), extra=extra)
 
     def to(self, *args, **kwargs) -> Self:
         """Move or cast all tensors, with the arguments of `Tensor.to`."""
@@ -134,14 +128,6 @@ class ViewTokens:
         return cls(tokens=tensors["tokens"], extra=extra, **_read_meta(tensors))
 
 
-def _concatenate(parts: Sequence[ViewTokens], dim: int) -> ViewTokens:
-    first = parts[0]
-    if any(p.image_hw != first.image_hw for p in parts):
-        raise ValueError(f"view tokens of different image sizes cannot be joined: {[p.image_hw for p in parts]}")
-    extra = {name: torch.cat([p.extra[name] for p in parts], dim) for name in first.extra}
-    return replace(first, tokens=torch.cat([p.tokens for p in parts], dim), extra=extra)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Features:
     """What the decoder reads: per layer the patch tokens and the special tokens of every view, in input order."""
@@ -154,15 +140,6 @@ class Features:
     def select(self, views: Sequence[int]) -> Self:
         """Return the chosen views, in the order given ("8->4" is `select([0, 2, 4, 6])`)."""
         return self._map(lambda t: t.index_select(1, torch.as_tensor(list(views), dtype=torch.long, device=t.device)))
-
-    @classmethod
-    def stack(cls, samples: Sequence[Features]) -> Features:
-        """Put several samples into one batch."""
-        levels = {
-            layer: tuple(torch.cat([s.levels[layer][k] for s in samples]) for k in (0, 1))
-            for layer in samples[0].levels
-        }
-        return replace(samples[0], levels=levels)
 
     def to(self, *args, **kwargs) -> Self:
         """Move or cast all tensors, with the arguments of `Tensor.to`."""
@@ -205,7 +182,7 @@ class Cameras:
     """(..., S, 3, 3), pixels of the images they travel with."""
 
     def to(self, device: torch.device | str) -> Self:
-        """Return the cameras on a device."""
+        """Move both tensors to a device."""
         return replace(self, T_cam_world=self.T_cam_world.to(device), K=self.K.to(device))
 
 

@@ -19,7 +19,8 @@ from freegeo.adaptation.adapter_files import (
     save_adapter,
 )
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.models.catalog import LoadedFrom, build_empty
+from freegeo.models.catalog import build_empty
+from freegeo.models.spec import LoadedFrom
 from tiny_models import attach, noise, outputs, same, tiny_da3, tiny_vggt, trained
 
 IMAGES = noise(4)

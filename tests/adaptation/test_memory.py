@@ -18,7 +18,8 @@ from freegeo.adaptation.views import schedule
 from freegeo.errors import UserError
 from freegeo.models.api import embed_in_chunks
 from freegeo.models.catalog import build_empty
-from freegeo.models.da3 import DA3, DA3Config
+from freegeo.models.da3 import DA3
+from freegeo.models.da3_config import DA3Config
 from freegeo.models.precision import Compute
 from tiny_models import DEFAULTS, randomise, tiny_da3, tiny_vggt
 

@@ -10,8 +10,8 @@ from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapt import learning_rate
 from freegeo.adaptation.views import schedule, view_sets
 from freegeo.errors import UserError
-from freegeo.models.api import AdaptationDefaults, ModelSpec
 from freegeo.models.catalog import build_empty
+from freegeo.models.spec import AdaptationDefaults, ModelSpec
 from tiny_models import tiny_da3
 
 SPEC = tiny_da3().spec

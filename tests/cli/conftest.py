@@ -10,7 +10,7 @@ from PIL import Image
 
 from freegeo.cli.app import main
 from freegeo.data.procedural import render, sample_rooms
-from freegeo.models.da3_presets import EMBEDDED_WEIGHTS
+from freegeo.models.da3_config import EMBEDDED_WEIGHTS
 
 PHOTOS = 4
 QUICK = ["--steps", "2", "--sets", "2"]

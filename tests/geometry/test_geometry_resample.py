@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from freegeo.errors import UserError
-from freegeo.geometry.resample import bilinear_align_corners, resize_area, resize_cubic, resize_nearest
+from freegeo.geometry.resample import resize_area, resize_cubic, resize_nearest
 
 side = st.integers(1, 160)
 
@@ -16,13 +16,11 @@ def noise(height, width, seed):
 
 
 def differences(resize, image, size, interpolation):
-    """Absolute differences from OpenCV; also checks that both layouts agree and the input survives."""
+    """Absolute differences from OpenCV; also checks that the input survives."""
     photo = torch.from_numpy(image.copy())
     ours = resize(photo, size)
-    planar = resize(photo.permute(2, 0, 1).contiguous(), size, layout="chw")
     assert ours.dtype == torch.uint8
     assert ours.shape == (*size, 3)
-    assert (planar.permute(1, 2, 0).int() - ours.int()).abs().max() <= 1
     assert np.array_equal(photo.numpy(), image)
     expected = cv2.resize(image, (size[1], size[0]), interpolation=interpolation)
     return np.abs(ours.numpy().astype(int) - expected.reshape(*size, 3))
@@ -86,10 +84,6 @@ def test_maps_keep_their_batch_and_type():
     masks = torch.rand(2, 3, 4, 6) > 0.5
     assert torch.equal(resize_nearest(masks, (4, 6)), masks)
     assert torch.equal(resize_nearest(masks, (8, 12))[..., ::2, ::2], masks)
-    values = torch.rand(2, 3, 4, 6)
-    larger = bilinear_align_corners(values, (7, 11))
-    assert torch.allclose(larger[..., ::2, ::2], values, atol=1e-6)
-    assert torch.allclose(larger[..., -1, -1], values[..., -1, -1])
 
 
 def test_impossible_requests_are_refused():

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from fixture_tools import fixture_path
 from freegeo.errors import UserError
-from freegeo.geometry.rotation import so3_exp
 from freegeo.geometry.se3 import camera_centres, from_Rt
 from freegeo.geometry.sim3 import DegenerateAlignmentError, Sim3, _draw_subsets, align_cameras, umeyama
+from rotations import rotation_of
 
 CASES = json.loads(fixture_path("benchmark", "sim3", "sim3_cases.json").read_text())
 ARRAYS = np.load(fixture_path("benchmark", "sim3", "sim3_cases.npz"))
@@ -52,7 +52,7 @@ def random_sim3(generator, *leading):
     def draw(*shape):
         return torch.randn((*leading, *shape), generator=generator, dtype=torch.float64)
 
-    return Sim3(s=draw().exp(), R=so3_exp(draw(3)), t=draw(3))
+    return Sim3(s=draw().exp(), R=rotation_of(draw(3)), t=draw(3))
 
 
 @given(seed=st.integers(0, 10**6), flat=st.booleans(), weighted=st.booleans())
@@ -87,7 +87,7 @@ def test_mirrored_points_still_give_a_rotation():
 def test_cameras_move_with_their_centres():
     generator = torch.Generator().manual_seed(3)
     move = random_sim3(generator)
-    T = from_Rt(so3_exp(torch.randn(5, 3, generator=generator, dtype=torch.float64)), torch.ones(5, 3).double())
+    T = from_Rt(rotation_of(torch.randn(5, 3, generator=generator, dtype=torch.float64)), torch.ones(5, 3).double())
     moved = move.apply_to_cameras(T)
     assert torch.allclose(camera_centres(moved), move.apply(camera_centres(T)), atol=1e-10)
     assert torch.allclose(moved[:, :3, :3].mT, move.R @ T[:, :3, :3].mT, atol=1e-12)
@@ -95,7 +95,7 @@ def test_cameras_move_with_their_centres():
 
 def test_an_outlier_camera_is_found():
     generator = torch.Generator().manual_seed(5)
-    R = so3_exp(torch.randn(12, 3, generator=generator, dtype=torch.float64))
+    R = rotation_of(torch.randn(12, 3, generator=generator, dtype=torch.float64))
     reference = from_Rt(R, torch.randn(12, 3, generator=generator, dtype=torch.float64))
     estimate = random_sim3(generator).apply_to_cameras(reference)
     estimate[4, :3, 3] += 30

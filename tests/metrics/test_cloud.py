@@ -3,9 +3,9 @@ import pytest
 import torch
 
 from freegeo.errors import UserError
-from freegeo.geometry.rotation import so3_exp
 from freegeo.geometry.se3 import from_Rt
 from freegeo.metrics.cloud import f1_rel5, morton_order, nearest_distances, score_clouds, voxel_average
+from rotations import rotation_of
 
 RNG = np.random.default_rng(0)
 
@@ -55,7 +55,7 @@ def test_bad_clouds_are_refused():
 
 def _small_scene():
     generator = torch.Generator().manual_seed(3)
-    R = so3_exp(0.2 * torch.randn(8, 3, generator=generator))
+    R = rotation_of(0.2 * torch.randn(8, 3, generator=generator))
     T = from_Rt(R, torch.randn(8, 3, generator=generator))
     K = torch.tensor([[20.0, 0, 12], [0, 20.0, 9], [0, 0, 1]]).expand(8, 3, 3)
     return 2 + torch.rand(8, 18, 24, generator=generator), K, T
@@ -63,7 +63,7 @@ def _small_scene():
 
 def test_f1_rel5_does_not_see_a_similarity():
     depth, K, T = _small_scene()
-    world = from_Rt(so3_exp(torch.tensor([0.5, 0.2, -0.8])), torch.tensor([3.0, -1.0, 2.0]))
+    world = from_Rt(rotation_of(torch.tensor([0.5, 0.2, -0.8])), torch.tensor([3.0, -1.0, 2.0]))
     moved = T @ world
     moved[:, :3, 3] *= 0.4
     score = f1_rel5(0.4 * depth, K, moved, depth, K, T)

@@ -4,20 +4,20 @@ import pytest
 import torch
 
 from freegeo.errors import UserError
-from freegeo.geometry.rotation import so3_exp
 from freegeo.geometry.se3 import from_Rt
 from freegeo.metrics.pose import area_under_curve, pair_errors, pose_auc, score_poses
+from rotations import rotation_of
 
 
 def trajectory(views: int, seed: int = 0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
-    R = so3_exp(torch.randn(views, 3, generator=generator, dtype=torch.float64))
+    R = rotation_of(torch.randn(views, 3, generator=generator, dtype=torch.float64))
     return from_Rt(R, torch.randn(views, 3, generator=generator, dtype=torch.float64))
 
 
 def test_a_similarity_of_the_ground_truth_is_perfect():
     T = trajectory(6)
-    R = so3_exp(torch.tensor([0.3, -1.0, 0.5], dtype=torch.float64))
+    R = rotation_of(torch.tensor([0.3, -1.0, 0.5], dtype=torch.float64))
     world = from_Rt(R, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
     moved = T @ world
     moved[:, :3, 3] *= 2.5
@@ -26,7 +26,7 @@ def test_a_similarity_of_the_ground_truth_is_perfect():
 
 def test_a_known_rotation_gives_its_angle():
     T = trajectory(2)
-    turn = from_Rt(so3_exp(torch.tensor([0.0, 0.0, math.radians(7)], dtype=torch.float64)), torch.zeros(3).double())
+    turn = from_Rt(rotation_of(torch.tensor([0.0, 0.0, math.radians(7)], dtype=torch.float64)), torch.zeros(3).double())
     errors = pair_errors(torch.stack([T[0], turn @ T[1]]), T)
     assert errors.rotation_deg.item() == pytest.approx(7, abs=1e-5)
 

@@ -1,4 +1,4 @@
-"""VGGT reproduces recorded numbers; its presets, limits and ways to read photos are as described."""
+"""VGGT reproduces recorded numbers; its variants, limits and ways to read photos are as described."""
 
 import sys
 from collections.abc import Callable
@@ -14,8 +14,10 @@ sys.path.append(str(TESTS))  # parity_vggt.py is shared with the full parity run
 
 from freegeo.data.photos import load_photos  # noqa: E402
 from freegeo.errors import UserError  # noqa: E402
+from freegeo.geometry.camera import photo_K  # noqa: E402
 from freegeo.models.catalog import build_empty  # noqa: E402
-from freegeo.models.vggt import CameraHead, VGGTConfig  # noqa: E402
+from freegeo.models.vggt import CameraHead  # noqa: E402
+from freegeo.models.vggt_config import VGGTConfig  # noqa: E402
 from freegeo.models.vggt_images import apply_plan, plan_size, preprocess  # noqa: E402
 from freegeo.types import Cameras  # noqa: E402
 from parity_vggt import build, cases  # noqa: E402
@@ -58,7 +60,7 @@ def test_trainable_values_at_rank_32():
     assert lora + model.get_parameter(model.camera_token_name).numel() == 25_167_872
 
 
-def test_both_presets_share_the_architecture_and_differ_in_the_licence():
+def test_both_variants_share_the_architecture_and_differ_in_the_licence():
     free, commercial = build_empty("vggt-1b"), build_empty("vggt-1b-commercial")
     assert free.config == commercial.config
     assert "non-commercial" in free.spec.weights_licence
@@ -111,27 +113,25 @@ def test_mixed_sizes_are_padded_white_around_the_centre(model, photos):
 
 
 def test_the_odd_pixel_of_a_border_is_at_the_end(photos):
-    batch = preprocess(photos((70, 21), (70, 28)), mode="longest", side=70, patch=7)
+    batch = preprocess(photos((70, 21), (70, 28)), side=70, patch=7)
     assert batch.images.shape == (2, 3, 28, 70)
     assert batch.offset_xy.tolist() == [[0.0, 3.0], [0.0, 0.0]]
     assert (batch.images[0, :, [0, 2, 24, 27]] == 1).all()
     assert not (batch.images[0, :, 3] == 1).all() and not (batch.images[0, :, 23] == 1).all()
 
 
-@pytest.mark.parametrize("mode", ["longest", "crop", "pad", "square"])
-def test_intrinsics_return_to_the_photo(model, photos, mode):
-    batch = model.preprocess(photos((90, 160), (120, 160)), mode=mode)
+def test_intrinsics_return_to_the_photo(model, photos):
+    batch = model.preprocess(photos((90, 160), (120, 160)))
     assert all(n % 14 == 0 for n in batch.images.shape[-2:])
     K = torch.tensor([[[100.0, 0.0, 44.0], [0.0, 110.0, 80.0], [0.0, 0.0, 1.0]]]).repeat(2, 1, 1).double()
-    assert torch.allclose(batch.photo_K(batch.model_K(K)), K)
+    assert torch.allclose(photo_K(batch.model_K(K), batch.scale_xy, batch.offset_xy), K)
 
 
-@pytest.mark.parametrize("mode", ["longest", "crop", "pad", "square"])
-def test_a_mark_lands_where_scale_and_offset_say(tmp_path, mode):
+def test_a_mark_lands_where_scale_and_offset_say(tmp_path):
     pixels = np.full((180, 110, 3), 128, np.uint8)
     pixels[80:84, 50:54] = (255, 0, 0)
     Image.fromarray(pixels).save(tmp_path / "mark.png")
-    batch = preprocess(load_photos(tmp_path), mode=mode, side=70, patch=14)
+    batch = preprocess(load_photos(tmp_path), side=70, patch=14)
     redness = (batch.images[0, 0] - batch.images[0, 1]).clamp(min=0)
     rows, columns = torch.meshgrid(*(torch.arange(n) + 0.5 for n in redness.shape), indexing="ij")
     found = torch.stack([(redness * axis).sum() / redness.sum() for axis in (columns, rows)])
@@ -139,23 +139,18 @@ def test_a_mark_lands_where_scale_and_offset_say(tmp_path, mode):
     assert (found - expected).abs().max() < 0.1
 
 
-@pytest.mark.parametrize(("size_wh", "mode"), [((13, 40), "longest"), ((400, 4), "crop"), ((400, 4), "pad")])
-def test_photos_smaller_than_a_patch_are_refused(photos, size_wh, mode):
+@pytest.mark.parametrize("size_wh", [(13, 40), (400, 4)])
+def test_photos_smaller_than_a_patch_are_refused(photos, size_wh):
     with pytest.raises(UserError, match=r"0\.png: a photo of \d+ x \d+ pixels is too small or too narrow"):
-        preprocess(photos(size_wh), mode=mode, side=518, patch=14)
-
-
-def test_unknown_modes_are_refused(photos):
-    with pytest.raises(UserError, match="choose one of longest, crop, pad, square"):
-        preprocess(photos((64, 48)), mode="stretch", side=518, patch=14)
+        preprocess(photos(size_wh), side=518, patch=14)
 
 
 @pytest.mark.parametrize("size_wh", [(504, 494), (520, 481), (640, 27), (511, 300), (27, 640)])
 def test_shrinking_by_area_equals_opencv_also_where_a_side_grows(size_wh):
     cv2 = pytest.importorskip("cv2")
     pixels = synthetic(*size_wh)
-    plan = plan_size(pixels.shape[:2], mode="longest", side=504, patch=14)
+    plan = plan_size(pixels.shape[:2], side=504, patch=14)
     assert plan.step == "area"
     ours = apply_plan(torch.from_numpy(pixels), plan).numpy().astype(int)
-    wanted = cv2.resize(pixels, plan.final[::-1], interpolation=cv2.INTER_AREA).astype(int)
+    wanted = cv2.resize(pixels, plan.resized[::-1], interpolation=cv2.INTER_AREA).astype(int)
     assert np.abs(ours - wanted).max() <= 1

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, get_origin
 from freegeo.errors import UserError
 
 if TYPE_CHECKING:
-    from freegeo.models.api import ModelSpec
+    from freegeo.models.spec import ModelSpec
 
 RecipeName = Literal["scene", "paper", "released-da3", "released-vggt"]
 DatasetName = Literal["eth3d", "7scenes", "scannetpp", "hiroom", "procedural"]

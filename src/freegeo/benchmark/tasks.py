@@ -25,7 +25,7 @@ import torch
 from freegeo.benchmark import sampling
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import as_json, read_json, write_json
-from freegeo.models.api import AdaptationDefaults
+from freegeo.models.spec import AdaptationDefaults
 from freegeo.run_folder import difference
 
 logger = logging.getLogger(__name__)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from freegeo.benchmark.paper.experiments import Experiment
     from freegeo.benchmark.predict import Predictor
     from freegeo.benchmark.tasks import FrameRule, Problem, Task
-    from freegeo.models.api import AdaptationDefaults
+    from freegeo.models.spec import AdaptationDefaults
 
 app = App(
     name="bench", help="Published evaluation: datasets, tables, comparison with the paper.", help_format="plaintext"

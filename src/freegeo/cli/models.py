@@ -99,8 +99,7 @@ def check(model: str, checkpoint: Path) -> None:
 
     path = checkpoints.find_file(checkpoint)
     item = catalog.entry(model)
-    rules = item.keys() if item.keys else checkpoints.KeyRules()
-    checkpoints.require_fit(catalog.build_empty(model), path, rules, model)
+    checkpoints.require_fit(catalog.build_empty(model), path, item.keys, model)
     console.say(f"{path}: fits {model} (fingerprint {checkpoints.fingerprint(path)})")
 
 

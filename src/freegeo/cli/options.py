@@ -18,8 +18,9 @@ SMALL_MODEL = 20_000_000
 """Parameters below which a model runs on one CPU thread."""
 
 if TYPE_CHECKING:
-    from freegeo.models.api import ModelSpec, ReconstructionModel
+    from freegeo.models.api import ReconstructionModel
     from freegeo.models.precision import Compute
+    from freegeo.models.spec import ModelSpec
 
 
 @Parameter(name="*")

@@ -109,12 +109,14 @@ class Reconstruction:
     def photo_K(self) -> np.ndarray:
         """Intrinsics (S, 3, 3) float64 of the original photos, pixel centres at whole numbers.
 
-        The inverse of the rule the models' intrinsics follow: `u_photo = (u_model - offset) / scale`.
+        By the rule of `freegeo.geometry.camera.photo_K`.
         """
-        K = self.cameras()[1].astype(np.float64)
-        K[:, :2, 2] -= self.offset_xy
-        K[:, :2] /= self.scale_xy[:, :, None]
-        return K
+        import torch
+
+        from freegeo.geometry.camera import photo_K
+
+        values = (self.cameras()[1].astype(np.float64), self.scale_xy, self.offset_xy)
+        return photo_K(*map(torch.from_numpy, values)).numpy()
 
     @classmethod
     def from_prediction(cls, prediction: Prediction, batch: ImageBatch) -> Reconstruction:

@@ -25,7 +25,7 @@ def extract_surface(blocks: Tensor, tsdf: Tensor, weight: Tensor, *, voxel: floa
     Returns:
         Vertices (V, 3) float64 in metres and triangles (T, 3) int64.
 
-    Source: benchmark protocol, section 7, mesh; classic 256-case tables.
+    Source: docs/benchmark.md, "Fusion and scoring"; classic 256-case tables.
     """
     cells, codes, values = _crossed_cubes(blocks, tsdf, weight)
     case_start, case_edges = (table.to(tsdf.device) for table in _tables())

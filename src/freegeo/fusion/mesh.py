@@ -44,7 +44,7 @@ def sample_surface(mesh: Mesh, count: int, *, seed: int) -> np.ndarray:
     Raises:
         UserError: the mesh has no triangle, or no area.
 
-    Source: benchmark protocol, section 7, surface sampling.
+    Source: docs/benchmark.md, "Fusion and scoring".
     """
     areas = mesh.triangle_areas()
     total = areas.sum()

@@ -1,7 +1,8 @@
 """Fusing depth maps into a truncated signed distance volume made of sparse blocks, one frame at a time.
 
-The arithmetic is that of the published evaluation (benchmark protocol, section 7): float32 values, classic projective
-distance measured along the ray, no maximum weight. Memory grows with the seen surface: 32 KiB per block of 16^3 voxels.
+The computation is that of the published evaluation (docs/benchmark.md, "Fusion and scoring"): float32 values, classic
+projective distance measured along the ray, no maximum weight. Memory grows with the seen surface: 32 KiB per block of
+16^3 voxels.
 """
 
 import torch

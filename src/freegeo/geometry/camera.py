@@ -1,9 +1,9 @@
 """Pinhole cameras: intrinsics, fields of view, projection and the models' pose encodings.
 
 The one pixel rule of this package: **the centre of the pixel in column ``u``, row ``v`` has the coordinates
-``(u, v)``**, whole numbers starting at 0 (``specs/vggt.md`` section 12). ``K`` is in pixels of the image it travels
-with. Where a model counts pixel centres differently (the ray head: ``u + 0.5``), the difference stays inside that
-function.
+``(u, v)``**, whole numbers starting at 0 (docs/models/vggt.md, "Unprojection"). ``K`` is in pixels of the image it
+travels with. Where a model counts pixel centres differently (the ray head: ``u + 0.5``), the difference stays inside
+that function.
 
 Axes are OpenCV's: x right, y down, z forward. Fields of view are full angles in radians, vertical and horizontal named.
 """
@@ -18,12 +18,11 @@ from freegeo.geometry.se3 import from_Rt, inverse
 __all__ = [
     "K_from_focal",
     "K_from_fov",
-    "crop_K",
     "decode_camera_to_world",
     "decode_world_to_camera",
     "encode_camera_to_world",
-    "encode_world_to_camera",
     "fov_from_K",
+    "photo_K",
     "pixel_grid",
     "project",
     "resize_K",
@@ -44,8 +43,8 @@ def K_from_fov(fov_vertical: Tensor, fov_horizontal: Tensor, image_hw: tuple[int
     """Intrinsics (..., 3, 3) from full fields of view (...) in radians; the principal point is ``(W / 2, H / 2)``.
 
     ``f = (side / 2) / max(tan(fov / 2), 1e-6)``: a field of view of 0, or above pi, gives a huge but finite focal
-    length (``specs/da3.md`` section 7). VGGT's decoder has no bound; the two agree wherever its result is finite and
-    positive (``specs/vggt.md`` section 11).
+    length (docs/models/da3.md, "Camera decoder"). VGGT's decoder has no bound; the two agree wherever its result is
+    finite and positive (docs/models/vggt.md, "Pose encoding").
     """
     height, width = image_hw
     focal_y = (height / 2) / (fov_vertical / 2).tan().clamp(min=SMALLEST_TANGENT)
@@ -66,15 +65,21 @@ def resize_K(K: Tensor, from_hw: tuple[int, int], to_hw: tuple[int, int]) -> Ten
     """``K`` (..., 3, 3) of an image resized from ``from_hw`` to ``to_hw``.
 
     Row 0 is multiplied by the width ratio, row 1 by the height ratio, principal point included and without a half-pixel
-    shift: the rule of both models and of the benchmark (``specs/da3.md`` section 11, ``specs/benchmark.md`` section 6).
+    shift: the rule of both models (docs/models/da3.md, "Images") and of the benchmark
+    (docs/benchmark.md, "Fusion and scoring").
     """
     ratios = K.new_tensor([to_hw[1] / from_hw[1], to_hw[0] / from_hw[0], 1.0])
     return K * ratios[:, None]
 
 
-def crop_K(K: Tensor, *, top: float, left: float) -> Tensor:
-    """``K`` (..., 3, 3) after removing ``top`` rows and ``left`` columns of the image (negative: padding)."""
-    return K - K.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+def photo_K(K: Tensor, scale_xy: Tensor, offset_xy: Tensor) -> Tensor:
+    """``K`` (..., 3, 3) of photos from that of a model's images, where a photo's pixel u is at ``u * scale + offset``.
+
+    ``scale_xy`` and ``offset_xy`` are (..., 2), x first. The offset is negative where a photo was cropped and positive
+    where it was padded; `ImageBatch` carries both. The principal point moves as any other place of the image.
+    """
+    rows = torch.cat((K[..., :2, :2], K[..., :2, 2:] - offset_xy[..., None]), dim=-1) / scale_xy[..., None]
+    return torch.cat((rows, K[..., 2:, :]), dim=-2)
 
 
 def pixel_grid(image_hw: tuple[int, int], *, like: Tensor) -> Tensor:
@@ -102,28 +107,26 @@ def decode_camera_to_world(encoding: Tensor, image_hw: tuple[int, int]) -> tuple
     """DA3's nine numbers (..., 9) as ``T_cam_world`` (..., 4, 4) and ``K`` (..., 3, 3) in pixels of ``image_hw``.
 
     The numbers are the *camera-to-world* pose: camera centre (3), quaternion xyzw of any length (4), vertical and
-    horizontal field of view (``specs/da3.md`` section 7).
+    horizontal field of view (docs/models/da3.md, "Camera decoder").
     """
     T_world_cam, K = _decode(encoding, image_hw)
     return inverse(T_world_cam), K
 
 
 def encode_camera_to_world(T_cam_world: Tensor, K: Tensor, image_hw: tuple[int, int]) -> Tensor:
-    """Cameras as DA3's nine camera-to-world numbers (..., 9); the principal point is ignored (``specs/da3.md`` 8)."""
-    return _encode(inverse(T_cam_world), K, image_hw)
+    """Cameras as DA3's nine camera-to-world numbers (..., 9) (docs/models/da3.md, "Known cameras")."""
+    T_world_cam = inverse(T_cam_world)
+    fov = torch.stack(fov_from_K(K, image_hw), dim=-1)
+    return torch.cat((T_world_cam[..., :3, 3], matrix_to_quat_xyzw(T_world_cam[..., :3, :3]), fov), dim=-1)
 
 
 def decode_world_to_camera(encoding: Tensor, image_hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """VGGT's nine numbers (..., 9) as ``T_cam_world`` (..., 4, 4) and ``K`` (..., 3, 3) in pixels of ``image_hw``.
 
-    As :func:`decode_camera_to_world`, but the numbers are the *world-to-camera* pose (``specs/vggt.md`` section 11).
+    As :func:`decode_camera_to_world`, but the numbers are the *world-to-camera* pose
+    (docs/models/vggt.md, "Pose encoding").
     """
     return _decode(encoding, image_hw)
-
-
-def encode_world_to_camera(T_cam_world: Tensor, K: Tensor, image_hw: tuple[int, int]) -> Tensor:
-    """Cameras as VGGT's nine world-to-camera numbers (..., 9); the principal point is ignored."""
-    return _encode(T_cam_world, K, image_hw)
 
 
 def _decode(encoding: Tensor, image_hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -131,8 +134,3 @@ def _decode(encoding: Tensor, image_hw: tuple[int, int]) -> tuple[Tensor, Tensor
         raise UserError(f"A pose encoding has 9 numbers, got shape {tuple(encoding.shape)}.")
     transform = from_Rt(quat_xyzw_to_matrix(encoding[..., 3:7]), encoding[..., :3])
     return transform, K_from_fov(encoding[..., 7], encoding[..., 8], image_hw)
-
-
-def _encode(transform: Tensor, K: Tensor, image_hw: tuple[int, int]) -> Tensor:
-    fov = torch.stack(fov_from_K(K, image_hw), dim=-1)
-    return torch.cat((transform[..., :3, 3], matrix_to_quat_xyzw(transform[..., :3, :3]), fov), dim=-1)

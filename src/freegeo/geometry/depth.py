@@ -12,7 +12,7 @@ SMALLEST_DEPTH = 1e-8
 
 
 def valid_depth(depth_z: Tensor) -> Tensor:
-    """Mask of usable depth, same shape: finite and above 1e-8 (``specs/vggt.md`` section 12)."""
+    """Mask of usable depth, same shape: finite and above 1e-8 (docs/models/vggt.md, "Unprojection")."""
     return torch.isfinite(depth_z) & (depth_z > SMALLEST_DEPTH)
 
 

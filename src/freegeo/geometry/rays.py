@@ -1,4 +1,4 @@
-"""Cameras from a predicted ray map (DA3's ``use_ray_pose``; ``specs/da3.md`` section 9).
+"""Cameras from a predicted ray map (DA3's ``use_ray_pose``; docs/models/da3.md, "Cameras from rays").
 
 A ray map gives each cell a direction and an origin in the reference frame. Directions are a homography of the image
 plane, ``direction ~ R_world_cam K^-1 (x, y, 1)``; it is estimated robustly and split into rotation and intrinsics.

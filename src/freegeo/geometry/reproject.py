@@ -1,4 +1,4 @@
-"""Where the pixels of one view land in another, and whether the other view sees the same surface there."""
+"""Where the pixels of one view land in another."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from freegeo.geometry.camera import project
 from freegeo.geometry.depth import unproject, valid_depth
 from freegeo.geometry.se3 import relative, transform_points
 
-__all__ = ["Agreement", "Reprojection", "compare_depth", "reproject"]
+__all__ = ["Reprojection", "reproject"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,15 +19,6 @@ class Reprojection:
     pixel: Tensor  # (..., H, W, 2) column and row in the target image; meaningless where in_view is False
     depth_z: Tensor  # (..., H, W) depth the target camera should measure there
     in_view: Tensor  # (..., H, W) bool: valid source depth, in front of the target and inside its image
-
-
-@dataclass(frozen=True, kw_only=True)
-class Agreement:
-    """What the target's own depth map says about reprojected pixels; all (..., H, W)."""
-
-    target_depth_z: Tensor  # the target's depth at the nearest pixel; 0 where there is none
-    visible: Tensor  # bool: in view, and no target surface stands in front
-    consistent: Tensor  # bool: in view, and the target surface lies at the expected depth
 
 
 def reproject(
@@ -57,27 +48,3 @@ def reproject(
     u, v = pixel.unbind(-1)
     inside = (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
     return Reprojection(pixel=pixel, depth_z=expected, in_view=usable & valid_depth(expected) & inside)
-
-
-def compare_depth(reprojection: Reprojection, target_depth_z: Tensor, *, relative_tolerance: float) -> Agreement:
-    """Look the reprojected pixels up in the target's depth map (..., H', W'), nearest pixel.
-
-    ``visible``: expected depth <= measured * (1 + tolerance). ``consistent``: both differ by at most tolerance times
-    the measured depth. Pixels whose target depth is invalid are neither.
-    """
-    height, width = target_depth_z.shape[-2:]
-    nearest = (reprojection.pixel + 0.5).floor()
-    column = torch.where(reprojection.in_view, nearest[..., 0], 0.0).long().clamp(0, width - 1)
-    row = torch.where(reprojection.in_view, nearest[..., 1], 0.0).long().clamp(0, height - 1)
-    index = (row * width + column).flatten(-2)
-    flat = target_depth_z.flatten(-2).expand(*index.shape[:-1], -1)
-    measured = flat.gather(-1, index).view_as(reprojection.depth_z)
-    comparable = reprojection.in_view & valid_depth(measured)
-    measured = torch.where(comparable, measured, 0.0)
-    difference = reprojection.depth_z - measured
-    allowed = relative_tolerance * measured
-    return Agreement(
-        target_depth_z=measured,
-        visible=comparable & (difference <= allowed),
-        consistent=comparable & (difference.abs() <= allowed),
-    )

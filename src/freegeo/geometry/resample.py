@@ -14,17 +14,13 @@ multiplies the first two rows of ``K`` by the ratios (see :func:`freegeo.geometr
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from freegeo.errors import UserError
 
-__all__ = ["bilinear_align_corners", "resize_area", "resize_cubic", "resize_nearest"]
-
-Layout = Literal["hwc", "chw"]
+__all__ = ["resize_area", "resize_cubic", "resize_nearest"]
 
 CUBIC_A = -0.75  # OpenCV's kernel parameter; Pillow and torch's antialiased bicubic use -0.5
 NEGLIGIBLE_COVERAGE = 1e-3  # OpenCV leaves out border pixels covered by less than this
@@ -39,24 +35,23 @@ class _Taps:
     weights: Tensor  # (n_out, taps) float64; unused taps have weight 0
 
 
-def resize_area(image: Tensor, size: tuple[int, int], *, layout: Layout = "hwc") -> Tensor:
+def resize_area(image: Tensor, size: tuple[int, int]) -> Tensor:
     """Shrink an 8-bit image by exact area averaging, as OpenCV's ``INTER_AREA``.
 
     Each output pixel is the mean of the input it covers, partly covered pixels counting by their covered fraction.
-    Source: the rule of DA3 (``specs/da3.md`` section 11) and VGGT (``specs/vggt.md`` section 14).
+    Source: the rule of DA3 (docs/models/da3.md, "Images") and VGGT (docs/models/vggt.md, "Images").
 
     Args:
-        image: (H, W, C), or (C, H, W) with ``layout="chw"``; uint8.
+        image: (H, W, C) uint8.
         size: (height, width) of the result, neither larger than the input.
-        layout: where the channels are.
 
     Returns:
-        uint8 image in the same layout.
+        uint8 image (height, width, C).
 
     Raises:
         UserError: the image is not 8-bit and three-dimensional, or a side would grow.
     """
-    height, width = _check_image(image, size, layout)
+    height, width = _check_image(image, size)
     if size[0] > height or size[1] > width:
         raise UserError(
             f"Area averaging cannot enlarge {height}x{width} to {size[0]}x{size[1]}; use resize_cubic if a side grows."
@@ -64,11 +59,11 @@ def resize_area(image: Tensor, size: tuple[int, int], *, layout: Layout = "hwc")
     if size == (height, width):
         return image.clone()
     if height % size[0] == 0 and width % size[1] == 0:
-        return _resize_whole_blocks(image, size, layout)
-    return _to_8bit(_resize_separable(image, size, layout, _area_taps, torch.float32))
+        return _resize_whole_blocks(image, size)
+    return _to_8bit(_resize_separable(image, size, _area_taps, torch.float32))
 
 
-def resize_cubic(image: Tensor, size: tuple[int, int], *, layout: Layout = "hwc") -> Tensor:
+def resize_cubic(image: Tensor, size: tuple[int, int]) -> Tensor:
     """Resize an 8-bit image with the cubic kernel a = -0.75 and no antialiasing, as OpenCV's ``INTER_CUBIC``.
 
     The border is replicated, results are rounded once and clamped to 0..255. Meant for enlarging; a shrinking side is
@@ -76,27 +71,26 @@ def resize_cubic(image: Tensor, size: tuple[int, int], *, layout: Layout = "hwc"
     precision; builds without that library quantise the weights to 11 bits and differ by one level in 4 % of values.
 
     Args:
-        image: (H, W, C), or (C, H, W) with ``layout="chw"``; uint8.
+        image: (H, W, C) uint8.
         size: (height, width) of the result.
-        layout: where the channels are.
 
     Returns:
-        uint8 image in the same layout.
+        uint8 image (height, width, C).
 
     Raises:
         UserError: the image is not 8-bit and three-dimensional, or the size is not positive.
     """
-    height, width = _check_image(image, size, layout)
+    height, width = _check_image(image, size)
     if size == (height, width):
         return image.clone()
-    return _to_8bit(_resize_separable(image, size, layout, _cubic_taps, torch.float32))
+    return _to_8bit(_resize_separable(image, size, _cubic_taps, torch.float32))
 
 
 def resize_nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
     """Nearest-neighbour resize of maps (..., H, W) of any dtype to (..., height, width).
 
-    The source index is ``floor(i * source / target)``, clamped (``specs/benchmark.md`` section 6 step 2), which is
-    OpenCV's ``INTER_NEAREST``: the first pixel maps to the first pixel and no half-pixel centre is involved.
+    The source index is ``floor(i * source / target)``, clamped, which is OpenCV's ``INTER_NEAREST``: the first pixel
+    maps to the first pixel and no half-pixel centre is involved (docs/benchmark.md, "Fusion and scoring").
 
     Raises:
         UserError: the size is not positive.
@@ -107,36 +101,27 @@ def resize_nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
     return values.index_select(-2, rows).index_select(-1, columns)
 
 
-def bilinear_align_corners(values: Tensor, size: tuple[int, int]) -> Tensor:
-    """Bilinear resize of floating maps (..., H, W) that maps corner pixel centres onto corner pixel centres."""
-    _check_size(size)
-    flat = values.reshape(-1, 1, *values.shape[-2:])
-    resized = F.interpolate(flat, size=size, mode="bilinear", align_corners=True)
-    return resized.reshape(*values.shape[:-2], *size)
-
-
 def _check_size(size: tuple[int, int]) -> None:
     if min(size) < 1:
         raise UserError(f"Cannot resize to {size[0]}x{size[1]}; both sides must be at least 1 pixel.")
 
 
-def _check_image(image: Tensor, size: tuple[int, int], layout: Layout) -> tuple[int, int]:
+def _check_image(image: Tensor, size: tuple[int, int]) -> tuple[int, int]:
     _check_size(size)
     if image.dtype != torch.uint8 or image.ndim != 3:
         raise UserError(f"Resizing needs an 8-bit image with three dimensions, got {image.dtype} {tuple(image.shape)}.")
-    height, width = image.shape[:2] if layout == "hwc" else image.shape[1:]
-    return height, width
+    return image.shape[0], image.shape[1]
 
 
-def _resize_whole_blocks(image: Tensor, size: tuple[int, int], layout: Layout) -> Tensor:
+def _resize_whole_blocks(image: Tensor, size: tuple[int, int]) -> Tensor:
     """Area average when every output pixel covers whole input pixels, where exact ties are common.
 
     OpenCV rounds ties up for 2x2 blocks (its integer shortcut) and to even otherwise.
     """
-    height, width = image.shape[:2] if layout == "hwc" else image.shape[1:]
+    height, width = image.shape[:2]
     block_area = (height // size[0]) * (width // size[1])
     dtype = torch.float32 if block_area < 2**16 else torch.float64  # whole sums stay exact below 2**24
-    total = _resize_separable(image, size, layout, _block_taps, dtype)
+    total = _resize_separable(image, size, _block_taps, dtype)
     if (height, width) == (2 * size[0], 2 * size[1]):
         return (total * 0.25 + 0.5).floor().to(torch.uint8)
     reciprocal = torch.tensor(1.0 / block_area, dtype=torch.float32, device=image.device)
@@ -144,27 +129,17 @@ def _resize_whole_blocks(image: Tensor, size: tuple[int, int], layout: Layout) -
 
 
 def _resize_separable(
-    image: Tensor,
-    size: tuple[int, int],
-    layout: Layout,
-    make_taps: Callable[[int, int], _Taps],
-    dtype: torch.dtype,
+    image: Tensor, size: tuple[int, int], make_taps: Callable[[int, int], _Taps], dtype: torch.dtype
 ) -> Tensor:
-    """Weighted sums along both axes, in ``dtype`` and the layout of the image.
+    """Weighted sums (height, width, C) along both axes of an image (H, W, C), in ``dtype``.
 
     Rows first, because whole rows are contiguous and most of the data disappears in that pass.
     """
-    height, width = image.shape[:2] if layout == "hwc" else image.shape[1:]
-    channels = image.shape[2] if layout == "hwc" else image.shape[0]
-    rows = image.reshape(1, height, -1) if layout == "hwc" else image
-    shorter = _apply_taps(rows, make_taps(height, size[0]), dtype)
-    if layout == "hwc":
-        shorter = shorter.view(size[0], width, channels).permute(1, 2, 0).reshape(1, width, -1)
-        total = _apply_taps(shorter, make_taps(width, size[1]), dtype).view(size[1], channels, size[0])
-        total = total.permute(2, 0, 1)
-    else:
-        total = _apply_taps(shorter.transpose(1, 2), make_taps(width, size[1]), dtype).transpose(1, 2)
-    return total.contiguous()
+    height, width, channels = image.shape
+    shorter = _apply_taps(image.reshape(height, -1), make_taps(height, size[0]), dtype)
+    columns_first = shorter.view(size[0], width, channels).permute(1, 2, 0).reshape(width, -1)
+    total = _apply_taps(columns_first, make_taps(width, size[1]), dtype).view(size[1], channels, size[0])
+    return total.permute(2, 0, 1).contiguous()
 
 
 def _to_8bit(total: Tensor) -> Tensor:
@@ -172,14 +147,14 @@ def _to_8bit(total: Tensor) -> Tensor:
 
 
 def _apply_taps(values: Tensor, taps: _Taps, dtype: torch.dtype) -> Tensor:
-    """Weighted sums along the middle axis of (B, n_in, M): returns (B, n_out, M) in ``dtype``."""
-    output = torch.empty(values.shape[0], len(taps.index), values.shape[2], dtype=dtype, device=values.device)
+    """Weighted sums along the first axis of (n_in, M): returns (n_out, M) in ``dtype``."""
+    output = torch.empty(len(taps.index), values.shape[1], dtype=dtype, device=values.device)
     for start in range(0, len(taps.index), GROUP):
         index, weights = taps.index[start : start + GROUP], taps.weights[start : start + GROUP]
         low, high = int(index.min()), int(index.max()) + 1
         band = torch.zeros(len(index), high - low, dtype=torch.float64).scatter_add_(1, index - low, weights)
         band = band.to(device=values.device, dtype=dtype)
-        torch.matmul(band, values[:, low:high].to(dtype), out=output[:, start : start + GROUP])
+        torch.matmul(band, values[low:high].to(dtype), out=output[start : start + GROUP])
     return output
 
 

@@ -1,7 +1,7 @@
-"""Rotations: quaternions, matrices, axis-angle vectors.
+"""Rotations: quaternions and matrices.
 
 The order of a quaternion's numbers is part of every name: ``quat_xyzw`` (scalar last; the DA3 and VGGT heads) or
-``quat_wxyz`` (scalar first; COLMAP). ``q`` and ``-q`` are the same rotation. Axis-angle vectors are in radians.
+``quat_wxyz`` (scalar first; COLMAP). ``q`` and ``-q`` are the same rotation.
 """
 
 import torch
@@ -15,12 +15,9 @@ __all__ = [
     "quat_xyzw_to_wxyz",
     "rotate",
     "rotation_angle",
-    "so3_exp",
-    "so3_log",
 ]
 
 SMALLEST_DIVISOR = 0.1  # the models' published rule; never reached by a true rotation, whose largest entry is >= 1
-SMALL_ANGLE = 1e-4  # below this, series to second order are exact to float64 rounding of the leading term
 
 
 def quat_wxyz_to_xyzw(quat_wxyz: Tensor) -> Tensor:
@@ -36,8 +33,7 @@ def quat_xyzw_to_wxyz(quat_xyzw: Tensor) -> Tensor:
 def quat_xyzw_to_matrix(quat_xyzw: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4), which need not have unit length.
 
-    The length is divided out (``specs/da3.md`` section 7, ``specs/vggt.md`` section 11). The zero quaternion is no
-    rotation and gives NaN.
+    The length is divided out (docs/models/da3.md, "Camera decoder"). The zero quaternion is no rotation and gives NaN.
     """
     x, y, z, w = quat_xyzw.unbind(-1)
     n = 2.0 / quat_xyzw.square().sum(-1)
@@ -53,8 +49,8 @@ def matrix_to_quat_xyzw(matrix: Tensor) -> Tensor:
     """Quaternions (..., 4), scalar last and ``w >= 0``, of rotation matrices (..., 3, 3).
 
     Of the four magnitudes of w, x, y, z the largest (first on ties) is taken and the others follow from it, which is
-    accurate for every rotation, half turns included (``specs/da3.md`` section 8.2). The result is not renormalised: a
-    matrix that is not quite a rotation gives a quaternion that is not quite of unit length.
+    accurate for every rotation, half turns included (docs/models/da3.md, "Known cameras"). The result is not
+    renormalised: a matrix that is not quite a rotation gives a quaternion that is not quite of unit length.
     """
     (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = (row.unbind(-1) for row in matrix.unbind(-2))
     squares = torch.stack((m00 + m11 + m22, m00 - m11 - m22, m11 - m00 - m22, m22 - m00 - m11), dim=-1) + 1
@@ -72,28 +68,6 @@ def matrix_to_quat_xyzw(matrix: Tensor) -> Tensor:
     quat_wxyz = quat_wxyz / (2 * largest_square.sqrt().clamp(min=SMALLEST_DIVISOR))
     quat_wxyz = torch.where(quat_wxyz[..., :1] < 0, -quat_wxyz, quat_wxyz)
     return quat_wxyz_to_xyzw(quat_wxyz)
-
-
-def so3_exp(axis_angle: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of axis-angle vectors (..., 3) in radians; differentiable at zero."""
-    squared_angle = axis_angle.square().sum(-1, keepdim=True)
-    is_small = squared_angle < SMALL_ANGLE**2
-    half_angle = torch.where(is_small, 1.0, squared_angle).sqrt() / 2
-    sine_over_angle = torch.where(is_small, 0.5 - squared_angle / 48, half_angle.sin() / (2 * half_angle))
-    cosine = torch.where(is_small, 1 - squared_angle / 8, half_angle.cos())
-    return quat_xyzw_to_matrix(torch.cat((axis_angle * sine_over_angle, cosine), dim=-1))
-
-
-def so3_log(matrix: Tensor) -> Tensor:
-    """Axis-angle vectors (..., 3), length 0..pi, of rotation matrices (..., 3, 3); differentiable at the identity."""
-    quat = matrix_to_quat_xyzw(matrix)
-    vector, scalar = quat[..., :3], quat[..., 3:]
-    squared_sine = vector.square().sum(-1, keepdim=True)
-    is_small = squared_sine < SMALL_ANGLE**2
-    sine = torch.where(is_small, 1.0, squared_sine).sqrt()
-    safe_scalar = torch.where(is_small, scalar, 1.0)  # close to 1 there; elsewhere it may be 0
-    series = 2 / safe_scalar - 2 * squared_sine / (3 * safe_scalar**3)
-    return vector * torch.where(is_small, series, 2 * torch.atan2(sine, scalar) / sine)
 
 
 def rotation_angle(matrix_a: Tensor, matrix_b: Tensor) -> Tensor:

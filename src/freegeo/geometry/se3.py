@@ -59,7 +59,7 @@ def transform_points(T_b_a: Tensor, points: Tensor) -> Tensor:
 
 
 def normalise_poses(T_cam_world: Tensor) -> Tensor:
-    """Poses (..., S, 4, 4) as the DA3 camera encoder expects them (``specs/da3.md`` section 12.2, steps 1 and 2).
+    """Poses (..., S, 4, 4) as the DA3 camera encoder expects them (docs/models/da3.md, "Known cameras").
 
     The first view becomes the identity, and lengths are divided by the lower median distance of the camera centres from
     it (over all views, the first included), at least 0.1. With two views the divisor is therefore always 0.1.

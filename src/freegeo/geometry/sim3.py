@@ -36,7 +36,7 @@ class Sim3:
         return scale * turned + self.t.reshape(*self.t.shape[:-1], *between, 3)
 
     def apply_to_cameras(self, T_cam_world: Tensor) -> Tensor:
-        """Move cameras (..., S, 4, 4): ``R' = R R_world_cam``, ``c' = s R c + t`` (``specs/benchmark.md`` section 5).
+        """Move cameras (..., S, 4, 4): ``R' = R R_world_cam``, ``c' = s R c + t``.
 
         The result is rigid; depth maps of these cameras must be multiplied by ``s``.
         """
@@ -65,7 +65,7 @@ class CameraAlignment:
 
 
 def umeyama(x: Tensor, y: Tensor, weights: Tensor | None = None) -> Sim3:
-    """Least-squares similarity ``y ~ s R x + t`` (Umeyama 1991, eq. 34-43; ``specs/benchmark.md`` section 5).
+    """Least-squares similarity ``y ~ s R x + t`` (Umeyama 1991, equations 34 to 43).
 
     Args:
         x: (..., N, 3) points to move.
@@ -113,7 +113,7 @@ def align_cameras(
     subset_size: int | None = None,
     inlier_threshold: float | None = None,
 ) -> CameraAlignment:
-    """Align estimated cameras with reference cameras by their centres (``specs/benchmark.md`` section 5).
+    """Align estimated cameras with reference cameras by their centres (docs/benchmark.md, "Fusion and scoring").
 
     With ``ransac`` (always, in scoring), ten random subsets of half of the views are fitted, the one with most inliers
     wins, and the transform is refitted on its inliers. Subsets come from ``numpy.random.default_rng(seed)``, so the

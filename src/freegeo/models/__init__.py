@@ -1,1 +1,1 @@
-"""Models: one contract (`api`), one catalog, one file per architecture."""
+"""Models: one contract (`api`), one catalog, and per architecture one module and one of its sizes (`*_config`)."""

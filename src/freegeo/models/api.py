@@ -8,51 +8,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from freegeo.errors import UserError
+from freegeo.models.spec import LoadedFrom, ModelSpec
 from freegeo.types import Cameras, Features, ImageBatch, PhotoLike, Prediction, ViewTokens
 
-if TYPE_CHECKING:
-    from freegeo.models.catalog import LoadedFrom
-
 Want = Literal["depth", "cameras", "rays", "points"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class AdaptationDefaults:
-    """What the method needs to know of one model: the published or measured settings that depend on its features."""
-
-    temperature: float
-    """Softmax temperature of the relational loss; about .6 to .8 of the features' rms."""
-    scene_lr: float
-    """Peak learning rate of the recipe `scene`."""
-    rank: int = 32
-    neighbours: bool = False
-    """Whether the model was trained on neighbouring frames only, so that its view sets are frames in a row."""
-    published: Literal["da3", "vggt"] | None = None
-    """Which of the two published families of settings a dataset recipe takes; None: the paper's DA3 column."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelSpec:
-    """What others need to know of a model without looking inside."""
-
-    name: str
-    patch_size: int
-    default_side: int
-    """Longest image side after `preprocess`, in pixels."""
-    loss_layers: tuple[int, ...]
-    """Layers whose features the losses compare, ascending; the last one carries the relational loss."""
-    reference: str
-    """Reference-view rule of the frozen model."""
-    special_tokens: int
-    weights_licence: str
-    adaptation: AdaptationDefaults
 
 
 class ReconstructionModel(nn.Module, ABC):

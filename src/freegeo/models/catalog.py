@@ -2,60 +2,29 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.models.spec import LoadedFrom, ModelEntry
 
 if TYPE_CHECKING:
     from freegeo.models.api import ReconstructionModel
-    from freegeo.models.checkpoints import KeyRules
 
 logger = logging.getLogger(__name__)
 
+FAMILIES = (
+    "freegeo.models.da3_config",
+    "freegeo.models.vggt_config",
+)
+"""Modules, free of torch, that list their models in `ENTRIES`; a new backbone of the package is named here."""
 DEFAULT_MODEL = "da3-base"
 EMBEDDED_MODEL = "freegeo-tiny"
 PLUGIN_GROUP = "freegeo.models"
 REACHABLE_WITHIN_S = 5.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelEntry:
-    """One line of the catalog; a plug-in's entry point names one of these."""
-
-    name: str
-    about: str
-    licence: str
-    """Licence of the weights."""
-    parameters: int
-    build: Callable[[], ReconstructionModel] | None = None
-    """Builds the model without weights; None: known, but not implemented."""
-    keys: Callable[[], KeyRules] | None = None
-    """Rules that translate the checkpoint's names; None: the names are the model's own."""
-    hub_id: str | None = None
-    hub_file: str = "model.safetensors"
-    gated: bool = False
-    """The hub hands the file out only to accounts that accepted its licence."""
-    packaged_weights: Path | None = None
-    """Weights that come with an installed package."""
-
-    @property
-    def download_gb(self) -> float:
-        """Size of the float32 checkpoint."""
-        return self.parameters * 4 / 1e9
-
-
-@dataclass(frozen=True, kw_only=True)
-class LoadedFrom:
-    """Where a model's weights came from; stored with everything made from them."""
-
-    model: str
-    file: str
-    fingerprint: str
-    licence: str
 
 
 def names() -> list[str]:
@@ -96,9 +65,8 @@ def load_model(name: str = DEFAULT_MODEL, *, checkpoint: str | Path | None = Non
     item = entry(name)
     build = _buildable(name)
     path = checkpoints.find_file(Path(checkpoint)) if checkpoint else _packaged_or_downloaded(item)
-    rules = item.keys() if item.keys else checkpoints.KeyRules()
     model = checkpoints.build_on_meta(build)
-    checkpoints.load_weights(model, path, rules, name)
+    checkpoints.load_weights(model, path, item.keys, name)
     model.eval()
     model.loaded_from = LoadedFrom(
         model=name, file=path.name, fingerprint=checkpoints.fingerprint(path), licence=item.licence
@@ -147,8 +115,6 @@ def _require_reachable(url: str) -> None:
 
 def _http_error() -> type[Exception]:
     """Return the base of the network errors of the hub library's client: httpx or httpx2, by its version."""
-    import importlib
-
     import huggingface_hub
 
     client = type(huggingface_hub.get_session()).__module__.partition(".")[0]
@@ -178,9 +144,7 @@ def _buildable(name: str) -> Callable[[], ReconstructionModel]:
 
 
 def _own_entries() -> dict[str, ModelEntry]:
-    from freegeo.models import da3_presets, vggt_presets
-
-    return {item.name: item for item in (*da3_presets.ENTRIES, *vggt_presets.ENTRIES)}
+    return {item.name: item for module in FAMILIES for item in importlib.import_module(module).ENTRIES}
 
 
 def _plugin_points() -> dict:

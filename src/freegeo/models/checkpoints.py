@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,29 +13,12 @@ import torch
 from torch import Tensor, nn
 
 from freegeo.errors import UserError
+from freegeo.models.spec import KeyRules
 
 Model = TypeVar("Model", bound=nn.Module)
 
 _BLOCK_BYTES = 1 << 16
 _BLOCKS = 64
-
-
-@dataclass(frozen=True, kw_only=True)
-class KeyRules:
-    """How the names in a checkpoint file become the names of a model's state dict."""
-
-    prefix: str = ""
-    """Removed from every name; a file without it is accepted too."""
-    skipped: tuple[str, ...] = ()
-    """Prefixes (after removal) of parts that are not built."""
-    aliases: Mapping[str, str] = field(default_factory=dict)
-    """Names of a shared tensor that a file may leave out -> the name it is stored under."""
-
-    def translate(self, names: Sequence[str]) -> dict[str, str]:
-        """Return our name -> file name, for the names that are not skipped."""
-        has_prefix = bool(self.prefix) and any(name.startswith(self.prefix) for name in names)
-        ours = {(name.removeprefix(self.prefix) if has_prefix else name): name for name in names}
-        return {our: name for our, name in ours.items() if not our.startswith(self.skipped or ("\0",))}
 
 
 def find_file(path: Path) -> Path:

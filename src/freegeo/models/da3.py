@@ -1,4 +1,4 @@
-"""Depth Anything 3, any-view models (spec: DA3 fact sheet, sections 1 to 8).
+"""Depth Anything 3, any-view models (docs/models/da3.md, "Stages" and what follows); variants are in da3_config.py.
 
 Per-view blocks, then alternating per-view and global blocks; a dual dense head for depth and rays; a camera decoder,
 and a camera encoder for known poses. Modules carry the official key names without the prefix `model.`.
@@ -10,8 +10,7 @@ per-view half), H W pixels.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
-from typing import Literal, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -19,9 +18,11 @@ from torch import Tensor, nn
 from freegeo.errors import UserError
 from freegeo.geometry.camera import decode_camera_to_world, encode_camera_to_world
 from freegeo.models import da3_images, reference
-from freegeo.models.api import ModelSpec, ReconstructionModel, Want, check_layers, check_want, level_tokens
+from freegeo.models.api import ReconstructionModel, Want, check_layers, check_want, level_tokens
+from freegeo.models.da3_config import DA3Config
 from freegeo.models.dpt import DenseHead, confidence, depth_maps, read_in_chunks
 from freegeo.models.images import normalise, patch_grid
+from freegeo.models.spec import ModelSpec
 from freegeo.models.transformer import (
     Block,
     Mlp,
@@ -35,39 +36,6 @@ from freegeo.models.transformer import (
 from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
 
 SELECTION = "selection"
-
-
-@dataclass(frozen=True, kw_only=True)
-class DA3Config:
-    """Every number of one variant."""
-
-    width: int
-    depth: int
-    heads: int
-    out_layers: tuple[int, int, int, int]
-    alt_start: int
-    """First block that comes after the views were given their camera token; odd blocks from here on are global."""
-    qknorm_start: int
-    rope_start: int
-    head_features: int
-    head_channels: tuple[int, int, int, int]
-    ffn: Literal["mlp", "swiglu"] = "mlp"
-    cat_token: bool = True
-    patch_size: int = 14
-    position_grid: int = 37
-    camera_encoder_depth: int = 4
-    camera_encoder_heads: int = 16
-
-    def __post_init__(self):
-        if self.alt_start < 2:
-            raise ValueError(f"alt_start must be at least 2, got {self.alt_start}")
-        if list(self.out_layers) != sorted(set(self.out_layers)):
-            raise ValueError(f"out_layers must ascend, got {self.out_layers}")
-
-    @property
-    def channels(self) -> int:
-        """Feature channels per token."""
-        return self.width * (2 if self.cat_token else 1)
 
 
 class Backbone(nn.Module):
@@ -240,7 +208,7 @@ class DA3(ReconstructionModel):
         ]
 
     def preprocess(self, photos: Sequence) -> ImageBatch:
-        """Resize as the reference does: longest side, then the nearest multiple of the patch (spec section 11)."""
+        """Resize to the default longest side, then to the nearest multiples of the patch."""
         return da3_images.preprocess(photos, side=self.spec.default_side, patch=self.config.patch_size)
 
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:

@@ -1,7 +1,9 @@
-"""The one dense head (DPT) of every model here (specs of DA3 section 6, VGGT section 9).
+"""The one dense head (DPT) of every model here.
 
 Four feature levels become a pyramid, are fused from coarse to fine and read out at image resolution. Letters:
 V views (batch and views flattened), P patches, C channels in, F head features, `grid` (h, w) in patches.
+
+Sources: docs/models/da3.md, "Dense head", and docs/models/vggt.md, "Dense heads".
 """
 
 from __future__ import annotations
@@ -68,7 +70,7 @@ class ResidualUnit(nn.Module):
 
 
 class Fusion(nn.Module):
-    """One step from coarse to fine."""
+    """One step from a coarse map to the next finer size, with that level's map (the lateral one) added."""
 
     def __init__(self, features: int, *, lateral: bool, rectified_skip: bool):
         super().__init__()
@@ -93,7 +95,7 @@ class Permute(nn.Module):
         self.order = order
 
     def forward(self, x: Tensor) -> Tensor:
-        """Permute the axes."""
+        """Return a view of x with its axes in the order of the constructor."""
         return x.permute(self.order)
 
 

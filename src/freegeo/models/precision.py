@@ -1,25 +1,19 @@
-"""Which arithmetic a model runs in: float32, or autocast to bfloat16 or float16 with float32 heads and norms."""
+"""The device and precision a model runs in: float32, or autocast to a half type with float32 heads and norms."""
 
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
-from torch import nn
 
 from freegeo.errors import UserError
 
-if TYPE_CHECKING:
-    from freegeo.models.api import ReconstructionModel
-
 Precision = Literal["fp32", "bf16", "fp16"]
 PRECISIONS: tuple[Precision, ...] = ("fp32", "bf16", "fp16")
-_DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
-
-
 CPU = torch.device("cpu")
+_DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,15 +23,15 @@ class Compute:
     device: torch.device = CPU
     precision: Precision = "fp32"
 
+    @classmethod
+    def choose(cls, device: str | None = None, precision: str | None = None) -> Compute:
+        """Return the device and precision asked for, or the best at hand; UserError when they are not there."""
+        chosen = choose_device(device)
+        return cls(device=chosen, precision=choose_precision(precision, chosen))
+
     def autocast(self) -> AbstractContextManager:
         """Return the context that a model's embed and aggregate run in."""
         return autocast(self.device, self.precision)
-
-    @classmethod
-    def choose(cls, device: str | None, precision: str | None) -> Compute:
-        """Return the device and precision asked for, or the best at hand."""
-        chosen = choose_device(device)
-        return cls(device=chosen, precision=choose_precision(precision, chosen))
 
 
 def choose_device(name: str | None) -> torch.device:
@@ -71,31 +65,3 @@ def choose_precision(name: str | None, device: torch.device) -> Precision:
 def autocast(device: torch.device, precision: Precision) -> AbstractContextManager:
     """Return the context that a model's embed and aggregate run in."""
     return nullcontext() if precision == "fp32" else torch.autocast(device.type, _DTYPES[precision])
-
-
-def cast_linears(model: ReconstructionModel, precision: Precision) -> None:
-    """Store the encoder's frozen linear weights in the half precision that autocast rounds them to.
-
-    Results under `autocast` stay the same to the bit and the weights take half the room. Norms, LayerScale, tokens,
-    trained parameters and everything outside the encoder (the heads) keep float32. Rounding is for good: reload the
-    model for float32 results, and run this one under `autocast`. Nothing happens for `fp32`.
-    """
-    if precision == "fp32":
-        return
-    for module in encoder(model).modules():
-        if isinstance(module, nn.Linear):
-            for parameter in module.parameters(recurse=False):
-                if not parameter.requires_grad:
-                    parameter.data = parameter.data.to(_DTYPES[precision])
-
-
-def encoder(model: ReconstructionModel) -> nn.Module:
-    """Return the innermost module that holds everything an adapter touches: `embed` and `aggregate`, but no head."""
-    names = [*model.adapter_targets(), *([model.camera_token_name] if model.camera_token_name else [])]
-    paths = [name.split(".")[:-1] for name in names]
-    common = []
-    for parts in zip(*paths, strict=False):
-        if len(set(parts)) > 1:
-            break
-        common.append(parts[0])
-    return model.get_submodule(".".join(common))

@@ -1,4 +1,4 @@
-"""Which view the others are described in: the rules of DA3's fact sheet, section 5."""
+"""Which view the others are described in: the rules of docs/models/da3.md, "Reference view"."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _min_max(metric_BS: Tensor) -> Tensor:
 
 
 def saddle_balanced(token_BSD: Tensor) -> Tensor:
-    """Return the view whose similarity, norm and spread lie closest to the middle of their ranges."""
+    """Return, for every scene, the view whose similarity, norm and spread lie closest to the middle of their ranges."""
     norm_BS = token_BSD.norm(dim=-1)
     unit_BSD = token_BSD / norm_BS[..., None]
     similarity_BS = _similarity(unit_BSD).sum(-1) / (token_BSD.shape[1] - 1)
@@ -33,18 +33,18 @@ def saddle_balanced(token_BSD: Tensor) -> Tensor:
 
 
 def saddle_sim_range(token_BSD: Tensor) -> Tensor:
-    """Return the view with the widest range of similarities; ties between a most similar pair are arbitrary."""
+    """Return, for every scene, the view with the widest range of similarities; the most similar pair may tie."""
     similarity_BSS = _similarity(token_BSD / token_BSD.norm(dim=-1, keepdim=True))
     return (similarity_BSS.amax(-1) - similarity_BSS.amin(-1)).argmax(1)
 
 
 def first(token_BSD: Tensor) -> Tensor:
-    """Return view 0."""
+    """Return view 0 for every scene, (B,) int64."""
     return torch.zeros(len(token_BSD), dtype=torch.long, device=token_BSD.device)
 
 
 def middle(token_BSD: Tensor) -> Tensor:
-    """Return view S // 2."""
+    """Return view S // 2 for every scene, (B,) int64."""
     return torch.full_like(first(token_BSD), token_BSD.shape[1] // 2)
 
 

@@ -1,6 +1,8 @@
-"""The one ViT block of every model here, with the two-axis RoPE (specs of DA3 section 4, VGGT sections 6 and 7).
+"""The one ViT block of every model here, with the two-axis RoPE.
 
 Letters: B batch (views or scenes), L tokens in one attention, N tokens of one view, H heads, d head width, D width.
+
+Sources: docs/models/da3.md, "Backbone"; docs/models/da3.md, "Rotary positions"; docs/models/vggt.md, "Blocks".
 """
 
 from __future__ import annotations
@@ -97,7 +99,7 @@ class Mlp(nn.Module):
         self.fc2 = nn.Linear(hidden, out or width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map the last axis."""
+        """Return fc2(gelu(fc1(x))), over the last axis."""
         return self.fc2(F.gelu(self.fc1(x)))
 
 
@@ -111,20 +113,20 @@ class SwiGlu(nn.Module):
         self.w3 = nn.Linear(hidden, width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map the last axis."""
+        """Return w3(silu(first half of w12(x)) * second half), over the last axis."""
         gate, value = self.w12(x).chunk(2, dim=-1)
         return self.w3(F.silu(gate) * value)
 
 
 class LayerScale(nn.Module):
-    """A learned factor per channel."""
+    """A learned factor per channel, which scales what a block adds to the residual stream."""
 
     def __init__(self, width: int):
         super().__init__()
         self.gamma = nn.Parameter(torch.ones(width))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Scale the last axis."""
+        """Multiply the channels, the last axis, by their factors."""
         return x * self.gamma
 
 

@@ -1,4 +1,4 @@
-"""VGGT (spec: VGGT fact sheet, sections 3 to 11).
+"""VGGT (docs/models/vggt.md, "Stages" and what follows); its sizes are in vggt_config.py.
 
 A DINOv2 encoder reads each view alone; 24 pairs of blocks then attend within each view (frame) and across all views
 (global); a camera head refines nine numbers per view over four steps, and two dense heads read depth and world points.
@@ -11,7 +11,6 @@ D width, C feature channels (2D: frame half, global half), H W pixels.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -20,9 +19,10 @@ from torch.nn import functional as F
 from freegeo.errors import UserError
 from freegeo.geometry.camera import decode_world_to_camera
 from freegeo.models import vggt_images
-from freegeo.models.api import ModelSpec, ReconstructionModel, Want, check_layers, check_want, level_tokens
+from freegeo.models.api import ReconstructionModel, Want, check_layers, check_want, level_tokens
 from freegeo.models.dpt import DenseHead, confidence, depth_maps, read_in_chunks
 from freegeo.models.images import normalise, patch_grid
+from freegeo.models.spec import ModelSpec
 from freegeo.models.transformer import (
     Block,
     Mlp,
@@ -33,46 +33,13 @@ from freegeo.models.transformer import (
     position_table,
     run_block,
 )
+from freegeo.models.vggt_config import VGGTConfig
 from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
 
 ENCODER_EPS = 1e-6
 BLOCK_EPS = 1e-5
 MODULATED_EPS = 1e-6
 CAMERA_STEPS = 4
-
-
-@dataclass(frozen=True, kw_only=True)
-class VGGTConfig:
-    """Every number of one variant."""
-
-    width: int
-    depth: int
-    """Number of frame blocks, and of global blocks."""
-    heads: int
-    encoder_depth: int
-    encoder_heads: int
-    camera_depth: int
-    camera_heads: int
-    out_layers: tuple[int, int, int, int]
-    head_features: int
-    head_channels: tuple[int, int, int, int]
-    registers: int = 4
-    patch_size: int = 14
-    position_grid: int = 37
-
-    def __post_init__(self):
-        if list(self.out_layers) != sorted(set(self.out_layers)) or self.out_layers[-1] != self.depth - 1:
-            raise ValueError(f"out_layers must ascend to the last layer {self.depth - 1}, got {self.out_layers}")
-
-    @property
-    def channels(self) -> int:
-        """Feature channels per token."""
-        return 2 * self.width
-
-    @property
-    def special(self) -> int:
-        """Tokens of a view that are no patches: the camera token and the registers."""
-        return 1 + self.registers
 
 
 class PatchEncoder(nn.Module):
@@ -227,11 +194,9 @@ class VGGT(ReconstructionModel):
             for name in block_linears(f"aggregator.{kind}.{i}", block)
         ]
 
-    def preprocess(self, photos: Sequence, *, mode: vggt_images.Mode = "longest") -> ImageBatch:
-        """Resize to the default longest side with the aspect kept, or to the training side in another mode."""
-        trained = self.config.position_grid * self.config.patch_size
-        side = self.spec.default_side if mode == "longest" else trained
-        return vggt_images.preprocess(photos, mode=mode, side=side, patch=self.config.patch_size)
+    def preprocess(self, photos: Sequence) -> ImageBatch:
+        """Resize to the default longest side, the aspect kept up to whole patches, as in the benchmark."""
+        return vggt_images.preprocess(photos, side=self.spec.default_side, patch=self.config.patch_size)
 
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:
         """Run the patch encoder on images (B, S, 3, H, W) in [0, 1].

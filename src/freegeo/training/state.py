@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from freegeo.files import atomic_path
 from freegeo.models.catalog import EMBEDDED_MODEL, build_empty
 from freegeo.models.da3 import DA3, Backbone
-from freegeo.models.da3_presets import keys
+from freegeo.models.da3_config import KEYS
 from freegeo.models.transformer import Block, initialise
 from freegeo.training.config import TrainConfig
 from freegeo.training.muon import Muon
@@ -161,7 +161,7 @@ def build_optimisers(model: DA3, read_outs: ReadOuts, config: TrainConfig) -> tu
 def averaged(state: State) -> DA3:
     """Return a model of its own with the averaged weights, on the CPU."""
     model = cast(DA3, build_empty(EMBEDDED_MODEL))
-    aliases = {alias: state.average[stored] for alias, stored in keys().aliases.items()}
+    aliases = {alias: state.average[stored] for alias, stored in KEYS.aliases.items()}
     weights = state.model.state_dict() | state.average | aliases
     model.load_state_dict({name: value.cpu().clone() for name, value in weights.items()}, assign=True)
     return model.requires_grad_(False).eval()

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from freegeo.models.catalog import ModelEntry
+from freegeo.models.spec import ModelEntry
 
 LICENCE = "Apache-2.0"
 

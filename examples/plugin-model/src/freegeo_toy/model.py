@@ -12,17 +12,10 @@ from torch.nn import functional as F
 from freegeo.errors import UserError
 from freegeo.geometry.camera import decode_world_to_camera
 from freegeo.geometry.se3 import inverse
-from freegeo.models.api import (
-    AdaptationDefaults,
-    ModelSpec,
-    ReconstructionModel,
-    Want,
-    check_layers,
-    check_want,
-    level_tokens,
-)
+from freegeo.models.api import ReconstructionModel, Want, check_layers, check_want, level_tokens
 from freegeo.models.da3_images import preprocess
 from freegeo.models.images import normalise, patch_grid
+from freegeo.models.spec import AdaptationDefaults, ModelSpec
 from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
 from freegeo_toy import LICENCE
 

@@ -1,0 +1,98 @@
+"""What a model says about itself, and one line of the catalog. Importing this file does not import torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from freegeo.models.api import ReconstructionModel
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptationDefaults:
+    """What the method needs to know of one model: the published or measured settings that depend on its features."""
+
+    temperature: float
+    """Softmax temperature of the relational loss; about .6 to .8 of the features' rms."""
+    scene_lr: float
+    """Peak learning rate of the recipe `scene`."""
+    rank: int = 32
+    neighbours: bool = False
+    """Whether the model was trained on neighbouring frames only, so that its view sets are frames in a row."""
+    published: Literal["da3", "vggt"] | None = None
+    """Which of the two published families of settings a dataset recipe takes; None: the paper's DA3 column."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSpec:
+    """What others need to know of a model without looking inside."""
+
+    name: str
+    patch_size: int
+    default_side: int
+    """Longest image side after `preprocess`, in pixels."""
+    loss_layers: tuple[int, ...]
+    """Layers whose features the losses compare, ascending; the last one carries the relational loss."""
+    reference: str
+    """Reference-view rule of the frozen model."""
+    special_tokens: int
+    """Tokens of a view that are no patches."""
+    weights_licence: str
+    adaptation: AdaptationDefaults
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeyRules:
+    """How the names in a checkpoint file become the names of a model's state dict."""
+
+    prefix: str = ""
+    """Removed from every name; a file without it is accepted too."""
+    skipped: tuple[str, ...] = ()
+    """Prefixes (after removal) of parts that are not built."""
+    aliases: Mapping[str, str] = field(default_factory=dict)
+    """Names of a shared tensor that a file may leave out -> the name it is stored under."""
+
+    def translate(self, names: Sequence[str]) -> dict[str, str]:
+        """Return our name -> file name, for the names that are not skipped."""
+        has_prefix = bool(self.prefix) and any(name.startswith(self.prefix) for name in names)
+        ours = {(name.removeprefix(self.prefix) if has_prefix else name): name for name in names}
+        return {our: name for our, name in ours.items() if not our.startswith(self.skipped or ("\0",))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelEntry:
+    """One line of the catalog; a plug-in's entry point names one of these."""
+
+    name: str
+    about: str
+    licence: str
+    """Licence of the weights."""
+    parameters: int
+    build: Callable[[], ReconstructionModel] | None = None
+    """Builds the model without weights; None: known, but not implemented."""
+    keys: KeyRules = KeyRules()
+    """Rules that translate the checkpoint's names; by default the names are the model's own."""
+    hub_id: str | None = None
+    hub_file: str = "model.safetensors"
+    gated: bool = False
+    """The hub hands the file out only to accounts that accepted its licence."""
+    packaged_weights: Path | None = None
+    """Weights that come with an installed package."""
+
+    @property
+    def download_gb(self) -> float:
+        """Size of the float32 checkpoint."""
+        return self.parameters * 4 / 1e9
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadedFrom:
+    """Where a model's weights came from; stored with everything made from them."""
+
+    model: str
+    file: str
+    fingerprint: str
+    licence: str
