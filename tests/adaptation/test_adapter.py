@@ -10,7 +10,7 @@ from freegeo.models.catalog import build_empty
 from tiny_models import attach, noise, outputs, same, tiny_da3, tiny_vggt, trained
 
 IMAGES = noise(4)
-# Fact sheet, section 5.
+# docs/method.md, "Adapter files".
 GIANT_COUNTS = {8: 5_311_488, 16: 10_619_904, 32: 21_236_736, 64: 42_470_400}
 VGGT_COUNTS = {8: 6_293_504, 16: 12_584_960, 32: 25_167_872, 64: 50_333_696}
 
