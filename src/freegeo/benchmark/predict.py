@@ -17,6 +17,7 @@ from torch import Tensor
 from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapt import Progress
 from freegeo.adaptation.adapter import Adapter
+from freegeo.adaptation.memory import plan_reconstruction
 from freegeo.adaptation.recipe import Recipe
 from freegeo.benchmark.adapters import AdapterJob, peak_memory_gb, reset_peak_memory, train, use
 from freegeo.benchmark.frames import require_truth
@@ -163,8 +164,7 @@ class Predictor:
     def forward(self, images: Tensor) -> Prediction:
         """One whole pass over images (S, 3, H, W) with the model as it stands."""
         with self.compute.autocast():
-            tokens = embed_in_chunks(self.model, images, device=self.compute.device)
-            return self.model.decode(self._features(tokens))
+            return self.model.decode(self._features(self._embedded(images)))
 
     def close(self) -> None:
         """Leave the model as it was loaded."""
@@ -204,11 +204,16 @@ class Predictor:
         """The embedded frames, and their true cameras as the model takes them when the run gives them away."""
         chosen = scene.select(frames)
         batch = self.model.preprocess(list(chosen.photos))
-        with self.compute.autocast():
-            tokens = embed_in_chunks(self.model, batch.images, device=self.compute.device)
+        tokens = self._embedded(batch.images)
         if not self.setup.given_cameras:
             return tokens, None
         return tokens, true_cameras(chosen, batch).to(self.compute.device)
+
+    def _embedded(self, images: Tensor) -> ViewTokens:
+        """Embed images (S, 3, H, W); UserError when so many cannot be reconstructed in the memory that is free."""
+        plan_reconstruction(self.model, len(images), (images.shape[-2], images.shape[-1]), compute=self.compute)
+        with self.compute.autocast():
+            return embed_in_chunks(self.model, images, device=self.compute.device)
 
     def _features(self, tokens: ViewTokens, cameras: Cameras | None = None) -> Features:
         with self.compute.autocast():
