@@ -59,7 +59,7 @@ def whole_run(tmp_path_factory, small_config, stopped_run):
 
 
 def test_a_stopped_run_ends_with_the_same_tensors(small_config, whole_run, stopped_run):
-    assert torch.load(stopped_run / state.STATE, weights_only=True)["counters"][0] == 4
+    assert torch.load(stopped_run / state.NEWEST_FILE, weights_only=True)["counters"][0] == 4
     assert not (stopped_run / loop.WEIGHTS).exists()
     expected, found = tensors(whole_run), tensors(train(small_config, stopped_run))
     assert expected.keys() == found.keys()
