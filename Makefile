@@ -4,7 +4,7 @@ BIN := .venv/bin
 READY := .venv/ready
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test test-slow test-browser test-oracle parity lint format clean
+.PHONY: demo test test-slow test-browser test-oracle test-matrix parity lint format clean
 
 demo: $(READY)
 	$(BIN)/freegeo demo --output out/demo
@@ -19,8 +19,19 @@ test-browser: $(READY)
 	$(PYTEST) -m browser
 
 test-oracle: $(READY)
-	$(BIN)/pip install -q -c constraints.txt open3d-cpu==0.19.0
+	$(BIN)/pip install -q -c constraints.txt -e '.[oracle]'
 	$(PYTEST) -m oracle
+
+# The suite with each instruction set of PyTorch and code path of MKL, with one and two threads: one line per setting.
+# MATRIX_ARGS are passed on to pytest; reports of failures stay in out/matrix.
+MATRIX := native ATEN_CPU_CAPABILITY=default ATEN_CPU_CAPABILITY=avx2 MKL_CBWR=COMPATIBLE MKL_CBWR=AVX2
+test-matrix: $(READY)
+	@mkdir -p out/matrix; failed=0; for threads in 1 2; do for setting in $(MATRIX); do \
+	    log=out/matrix/$$setting-$$threads.txt; begun=$$(date +%s); \
+	    if env $${setting#native} OMP_NUM_THREADS=$$threads $(BIN)/python -m pytest -n $$((3 - threads)) \
+	        $(MATRIX_ARGS) >$$log 2>&1; then word=passed; else word=FAILED; failed=1; fi; \
+	    echo "$$setting, threads: $$threads: $$word in $$(($$(date +%s) - begun)) s: $$(tail -1 $$log)"; \
+	done; done; exit $$failed
 
 # FREEGEO_FIXTURES=DIR checks another folder of recorded numbers.
 parity: $(READY)

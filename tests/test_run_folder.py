@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from freegeo import files
-from freegeo import run_folder as run_folders
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import LEDGER_FILE, LOCK_FILE, RUN_FILE, write_json
 from freegeo.run_folder import check_folder, difference, locked, run_folder
@@ -199,11 +198,14 @@ def test_ledger_never_leads_out_of_the_folder(tmp_path):
 def test_removal_that_is_cut_short_does_not_pass_for_a_finished_result(tmp_path, monkeypatch):
     result(tmp_path)
 
-    def stop(self, *args, **options):
+    plain = Path.unlink
+
+    def unlink_and_stop(path, **options):
+        plain(path, **options)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(run_folders, "_remove_parts", stop)
+        patch.setattr(Path, "unlink", unlink_and_stop)
         with pytest.raises(KeyboardInterrupt), run_folder(tmp_path, {}, overwrite=True):
             pass
     with run_folder(tmp_path, SETTINGS) as run:

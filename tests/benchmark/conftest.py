@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import pytest
-import torch
 
 from bench_tools import DATASET, ROOMS, small_room
 from freegeo.benchmark import predict
@@ -19,10 +18,9 @@ def small_rooms(monkeypatch):
 
 
 @pytest.fixture
-def tiny_model(monkeypatch):
+def tiny_model(monkeypatch, one_thread):
     """Every model name loads the same small model of random weights."""
     monkeypatch.setattr(predict, "load_model", lambda name, checkpoint=None: tiny_da3())
-    torch.set_num_threads(1)
 
 
 @pytest.fixture

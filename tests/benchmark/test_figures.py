@@ -2,13 +2,15 @@ import numpy as np
 from PIL import Image
 
 from bench_tools import DATASET, ROOMS, store_truth, task
+from freegeo.benchmark.paper import figures
 from freegeo.benchmark.paper.figures import CloudPanel, cloud_figure, curve_figure, depth_panel, draw_all, save_figure
 from freegeo.benchmark.results import rows_of
 from freegeo.benchmark.score import evaluate_all
 from freegeo.data.datasets.registry import load_scene
 
 
-def test_a_benchmark_folder_gets_its_figures_in_both_formats(tmp_path, small_rooms):
+def test_a_benchmark_folder_gets_its_figures_in_both_formats(tmp_path, small_rooms, monkeypatch):
+    monkeypatch.setattr(figures, "CLOUD_POINTS", 500)
     data, out = tmp_path / "data", tmp_path / "out"
     tasks = [task(), task("adapted"), task(views=8), task(rule="experiment"), task("8to4", rule="experiment")]
     for one in tasks:

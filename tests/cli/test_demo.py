@@ -1,48 +1,57 @@
 """The demo: a generated room, scored before and after, with an honest sentence about what came of it."""
 
+import io
 import json
+from contextlib import redirect_stdout
 
 import pytest
 
 from cli.conftest import QUICK
 from freegeo.cli import demo, sources
+from freegeo.cli.app import main
 from freegeo.files import RUN_FILE
 
 SCORE = {"auc05": 0.1, "auc15": 0.2, "auc30": 0.5, "abs_rel": 0.2, "f1_rel5": 0.3}
 
 
-@pytest.fixture(scope="module")
-def out(tmp_path_factory):
-    return tmp_path_factory.mktemp("demo") / "out"
-
-
-@pytest.fixture(autouse=True)
-def short_path(monkeypatch):
+@pytest.fixture(scope="module", autouse=True)
+def short_path():
     """Photograph eight views instead of sixteen."""
-    monkeypatch.setattr(sources, "DEMO_FRAMES", 8)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sources, "DEMO_FRAMES", 8)
+        yield
 
 
-def test_demo_scores_both_models_and_points_to_the_files(freegeo, tiny, out):
-    outcome = freegeo("demo", "-o", out, "--checkpoint", tiny[3], *QUICK)
-    assert outcome.code == 0, outcome.err
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, tiny, short_path):
+    """Folder of a demo that ran to its end, and what it printed."""
+    out, printed = tmp_path_factory.mktemp("demo") / "out", io.StringIO()
+    with redirect_stdout(printed):
+        assert main(["demo", "-o", str(out), "--checkpoint", tiny[3], *QUICK]) == 0
+    return out, printed.getvalue()
+
+
+def test_demo_scores_both_models_and_points_to_the_files(finished):
+    out, printed = finished
     scores = json.loads((out / "scores.json").read_text())
     assert set(scores) == {"frozen", "adapted"}
     for model in scores.values():
         assert set(model) == {"4", "8"}
         for score in model.values():
             assert set(score) >= set(SCORE)
-    rows = [line.split() for line in outcome.out.splitlines()]
+    rows = [line.split() for line in printed.splitlines()]
     for views in ("4", "8"):
         for name in ("frozen", "adapted"):
             (row,) = [row for row in rows if row[:2] == [views, name]]
             assert row[2] == f"{scores[name][views]['auc05']:.3f}"
-        assert f"{views} views: adaptation" in outcome.out
+        assert f"{views} views: adaptation" in printed
     assert len(list((out / "photos").glob("*.png"))) == 8
-    assert str(out / "scene.glb") in outcome.out
+    assert str(out / "scene.glb") in printed
     assert (out / "frozen" / "prediction.npz").is_file()
 
 
-def test_finished_demo_shows_its_table_again(freegeo, tiny, out):
+def test_finished_demo_shows_its_table_again(freegeo, tiny, finished):
+    out, _ = finished
     outcome = freegeo("demo", "-o", out, "--checkpoint", tiny[3], *QUICK)
     assert outcome.code == 0
     assert "already finished" in outcome.out

@@ -1,6 +1,7 @@
 """`run`, `adapt` and `reconstruct`: what they write, that they continue, and that they leave results alone."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -252,6 +253,31 @@ def test_interrupted_run_continues_to_the_same_result(
     assert files(out) == files(finished)
 
 
+def test_what_a_killed_process_leaves_continues_to_the_same_result(
+    freegeo, finished, photo_folder, tiny, tmp_path, monkeypatch
+):
+    out, left, steps = tmp_path / "out", tmp_path / "left", []
+    losses = adapting.adaptation_loss
+
+    def copied(*arguments, **options):
+        if len(steps) == 1:
+            shutil.copytree(out, left)
+        steps.append(len(steps))
+        return losses(*arguments, **options)
+
+    monkeypatch.setattr(adapting, "SAVE_EVERY_S", -1.0)
+    monkeypatch.setattr(adapting, "adaptation_loss", copied)
+    assert freegeo("run", photo_folder, "-o", out, *tiny, *QUICK).code == 0
+    assert {RUN_FILE, LOCK_FILE, "adapter"} <= {path.name for path in left.iterdir()}
+    assert (left / "adapter" / UNFINISHED_FILE).is_file()
+    outcome = freegeo("run", photo_folder, "-o", left, *tiny, *QUICK)
+    assert outcome.code == 0, outcome.err
+    assert len(steps) == 2 + 1
+    assert same(prediction(left), prediction(finished))
+    assert files(left) == files(finished)
+
+
+@pytest.mark.slow
 def test_killed_process_continues_to_the_same_result(freegeo, finished, photo_folder, tiny, tmp_path):
     out = tmp_path / "out"
     arguments = ["run", str(photo_folder), "-o", str(out), *tiny, *QUICK]

@@ -21,7 +21,7 @@ from freegeo.data.procedural import (
     sample_rooms,
 )
 from freegeo.data.procedural.raytrace import RenderedViews
-from freegeo.data.procedural.rooms import CLEARANCE_M, FIRST_SPHERE, _distance
+from freegeo.data.procedural.rooms import CLEARANCE_M, FIRST_CYLINDER, FIRST_SPHERE
 from freegeo.data.procedural.textures import BANKS, LEVEL_SIZES, TEXTURE_COUNT, texture_bank
 from freegeo.errors import UserError
 from freegeo.geometry.camera import K_from_fov, resize_K
@@ -65,13 +65,31 @@ def camera_centres(batch: RoomBatch) -> torch.Tensor:
     return inverse(batch.T_cam_room)[..., :3, 3]
 
 
+def distance_to_furniture(points: torch.Tensor, batch: RoomBatch) -> torch.Tensor:
+    """Signed distance of points (B, N, 3) from the surface of every primitive but the room; infinite where absent.
+
+    A signed distance q per side gives the distance from a convex body: |max(q, 0)| outside, max(q) inside.
+    """
+    offset = points[:, :, None] - batch.center[:, None, 1:]
+    size, (cosine, sine) = batch.size[:, None, 1:], batch.yaw[:, None, 1:].unbind(-1)
+    x, y, z = offset.unbind(-1)
+    turned = torch.stack([cosine * x + sine * y, cosine * y - sine * x, z], dim=-1)
+    box = turned.abs() - size
+    sphere = (offset.norm(dim=-1) - size[..., 0])[..., None]
+    cylinder = torch.stack([torch.hypot(x, y) - size[..., 0], z.abs() - size[..., 2]], dim=-1)
+    by_kind = [sides.clamp(min=0).norm(dim=-1) + sides.amax(-1).clamp(max=0) for sides in (box, sphere, cylinder)]
+    ends = (0, FIRST_SPHERE - 1, FIRST_CYLINDER - 1, offset.shape[2])
+    distance = torch.cat([d[..., a:b] for d, (a, b) in zip(by_kind, pairwise(ends), strict=True)], dim=-1)
+    return torch.where(size[..., 0] > 0, distance, torch.inf)
+
+
 def test_every_pixel_unprojects_onto_a_surface_of_the_room():
     batch, rendered = rooms(), views()
     points_cam = unproject(rendered.depth_z.double(), rendered.K.double())
     points = transform_points(inverse(rendered.T_cam_world.double()), points_cam).flatten(1, 3)
     points_room = transform_points(batch.T_room_world.double(), points).float()
     wall = (points_room.sub(batch.center[:, None, 0]).abs() - batch.size[:, None, 0]).amax(-1).abs()
-    surface = _distance(points_room, batch.center, batch.yaw, batch.size)[..., 1:].abs().amin(-1)
+    surface = distance_to_furniture(points_room, batch).abs().amin(-1)
     assert torch.minimum(wall, surface).max() < 2e-4
 
 
@@ -133,8 +151,7 @@ def test_cameras_stand_inside_off_the_walls_and_clear_of_everything(domain):
     assert (batch.size[:, None, 0, :2] - centres[..., :2].abs()).min() > 0.29
     assert centres[..., 2].min() > 0.9 and centres[..., 2].max() < 1.9
     present = batch.size[:, 1:, 0] > 0
-    distance = _distance(centres, batch.center, batch.yaw, batch.size)[..., 1:]
-    assert distance.amin(1)[present].min() >= CLEARANCE_M
+    assert distance_to_furniture(centres, batch).min() >= CLEARANCE_M
     assert 0.5 < present.float().mean() < 1.0
 
 
@@ -171,7 +188,7 @@ def test_a_seed_gives_its_room_whatever_the_batch():
 def test_slices_and_chunks_leave_the_picture_alone(monkeypatch):
     whole = render(rooms().rooms(2, 4), 12, 16)
     assert torch.equal(whole.depth_z, render(rooms(), 12, 16).depth_z[2:4])
-    monkeypatch.setattr("freegeo.data.procedural.raytrace._RAYS_PER_CHUNK_CPU", 1)
+    monkeypatch.setattr("freegeo.data.procedural.raytrace.RAYS_PER_CHUNK_CPU", 1)
     view_by_view = render(rooms().rooms(2, 4), 12, 16)
     assert torch.allclose(whole.images, view_by_view.images, atol=1e-6)
     assert torch.equal(whole.depth_z, view_by_view.depth_z)

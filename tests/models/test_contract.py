@@ -1,5 +1,6 @@
 """What holds for every reconstruction model here, on the small DA3 and the small VGGT with recorded weights."""
 
+import copy
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -56,11 +57,11 @@ def block_calls(model: nn.Module, call) -> int:
 
 @torch.no_grad()
 def test_tokens_of_selected_views_equal_those_of_selected_images(model):
-    x, kept = images(), [0, 2, 4]
-    selected, alone = model.embed(x).select(kept), model.embed(x[:, kept])
-    assert torch.equal(selected.tokens, alone.tokens)
-    assert selected.extra.keys() == alone.extra.keys()
-    assert all(torch.equal(selected.extra[name], alone.extra[name]) for name in alone.extra)
+    # In float64: a matrix of other height may be multiplied in another order.
+    model, x, kept = copy.deepcopy(model).double(), images().double(), [0, 2, 4]
+    selected, alone = model.embed(x).select(kept).tensors(), model.embed(x[:, kept]).tensors()
+    assert selected.keys() == alone.keys()
+    assert all(relative_error(selected[name], alone[name]) <= 1e-12 for name in alone)
 
 
 @torch.no_grad()

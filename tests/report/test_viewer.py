@@ -1,4 +1,6 @@
 import dataclasses
+import io
+import itertools
 import socket
 
 import numpy as np
@@ -11,8 +13,6 @@ from freegeo.errors import UserError
 from freegeo.geometry.rotation import quat_wxyz_to_xyzw, quat_xyzw_to_matrix
 
 pytest.importorskip("viser")
-import itertools
-
 from freegeo.cli import view as command
 from freegeo.report import viewer
 
@@ -46,30 +46,26 @@ def test_the_controls_show_and_hide(opened):
     assert visible(opened.bands[names["adapted"]]) == viewer.BANDS
     assert visible(opened.bands[names["frozen"]]) == 0
     opened.hidden.value = 50
-    opened._apply()
     assert visible(opened.bands[names["adapted"]]) == viewer.BANDS // 2
     opened.shown.value = "frozen"
-    opened._apply()
     assert visible(opened.bands[names["frozen"]]) == viewer.BANDS // 2
     assert visible(opened.frusta[names["frozen"]]) == 4
     assert visible(opened.frusta[names["adapted"]]) == 0
-    opened._swap()
+    opened.swap.value = True
     assert opened.shown.value == "adapted"
     before = opened.bands[names["adapted"]][-1].colors.copy()
     opened.mode.value = "error"
-    opened._recolour()
     assert not np.array_equal(before, opened.bands[names["adapted"]][-1].colors)
 
 
 def test_bands_hold_the_kept_points_by_confidence(opened):
     layer = next(x for x in opened.layers if x.stage.key == "adapted")
-    points = np.concatenate([handle.points for handle in opened.bands[layer.name]])
-    kept = layer.stage.world_points()[layer.stage.keep]
-    assert np.allclose(np.sort(points, axis=0), np.sort(kept, axis=0))
-    ranges = {"depth": (1.0, 2.0), "confidence": (1.0, 2.0)}
-    _, _, order = viewer._banded(layer.stage, layer.result.images, ranges)
-    conf = layer.stage.conf[layer.stage.keep]
-    assert all(conf[a].max() <= conf[b].min() for a, b in itertools.pairwise(order))
+    kept = layer.stage.world_points()[layer.stage.keep].astype(np.float32)
+    conf_of = dict(zip(map(tuple, kept), layer.stage.conf[layer.stage.keep], strict=True))
+    bands = [list(map(tuple, handle.points)) for handle in opened.bands[layer.name]]
+    assert sorted(itertools.chain(*bands)) == sorted(conf_of)
+    conf = [[conf_of[point] for point in band] for band in bands]
+    assert all(max(less) <= min(more) for less, more in itertools.pairwise(conf))
 
 
 def test_cameras_are_handed_over_in_the_right_frame(opened):
@@ -114,7 +110,7 @@ def test_the_mesh_follows_its_points(tmp_path):
     shown = viewer.open_viewer([folder], port=free_port())
     try:
         layer = next(x for x in shown.layers if x.stage.key == "adapted")
-        mesh = viewer._mesh(layer)
+        mesh = trimesh.load_mesh(io.BytesIO(shown.meshes[layer.name].glb_data), file_type="glb")
         assert np.allclose(mesh.vertices, layer.stage.world_points()[0][[0, 0, 5], [0, 5, 0]], atol=1e-4)
         assert list(shown.meshes) == [layer.name]
     finally:
@@ -130,11 +126,18 @@ def test_a_port_in_use_is_one_sentence(example):
             viewer.open_viewer([example], port=port)
 
 
+def test_a_host_without_address_is_one_sentence(example, monkeypatch):
+    def no_such_name(*arguments, **options):
+        raise socket.gaierror
+
+    monkeypatch.setattr(socket, "getaddrinfo", no_such_name)
+    with pytest.raises(UserError, match="--host nowhere: no such address"):
+        viewer.open_viewer([example], host="nowhere", port=8080)
+
+
 def test_what_cannot_be_shown_is_refused(example, tmp_path):
     with pytest.raises(UserError, match="--port must be"):
         viewer.open_viewer([example], port=0)
-    with pytest.raises(UserError, match="--host"):
-        viewer.open_viewer([example], host="no.such.host.invalid", port=free_port())
     with pytest.raises(UserError, match="holds no reconstruction"):
         viewer.open_viewer([tmp_path], port=free_port())
     dataclasses.replace(room(2), T_cam_world=None, K=None).save(tmp_path)

@@ -38,13 +38,35 @@ def tensors(path):
 
 
 @pytest.fixture(scope="module")
-def whole_run(tmp_path_factory, small_config):
+def stopped_run(tmp_path_factory):
+    """The folder of `whole_run` as it stood after the fourth step."""
+    return tmp_path_factory.mktemp("stopped") / "run"
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory, small_config, stopped_run):
     """A run that was never stopped; read only."""
+    folder = tmp_path_factory.mktemp("whole")
+
+    def save_and_copy(now):
+        patch.setattr(loop, "SAVE_EVERY_S", 0.0 if now.step == 3 else 120.0)
+        if now.step == 4:
+            shutil.copytree(folder, stopped_run)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pool, "ROOMS_PER_SHARD", 2)
-        return train(small_config, tmp_path_factory.mktemp("whole"))
+        return train(small_config, folder, progress=save_and_copy)
 
 
+def test_a_stopped_run_ends_with_the_same_tensors(small_config, whole_run, stopped_run):
+    assert torch.load(stopped_run / state.NEWEST_FILE, weights_only=True)["counters"][0] == 4
+    assert not (stopped_run / loop.WEIGHTS).exists()
+    expected, found = tensors(whole_run), tensors(train(small_config, stopped_run))
+    assert expected.keys() == found.keys()
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
 def test_a_killed_run_ends_with_the_same_tensors(tmp_path, small_config, whole_run):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}

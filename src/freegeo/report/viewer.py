@@ -134,7 +134,9 @@ class Viewer:
         labels = [layer.label for layer in self.layers]
         final = next(layer.label for layer in self.layers if layer.stage is layer.result.final)
         self.shown = gui.add_dropdown("Shown", labels, initial_value=final)
-        swap = gui.add_button("Swap frozen / adapted", disabled=len({layer.stage.key for layer in self.layers}) < 2)
+        self.swap = gui.add_button(
+            "Swap frozen / adapted", disabled=len({layer.stage.key for layer in self.layers}) < 2
+        )
         modes = [m for m in MODES if all(m in colours for colours in self.colours.values())]
         self.mode = gui.add_dropdown("Colour", modes, initial_value="photo")
         self.hidden = gui.add_slider("Hide least confident %", 0, 95, 5, 0)
@@ -150,7 +152,7 @@ class Viewer:
         self.mode.on_update(lambda _: self._recolour())
         self.follow.on_update(lambda _: self._apply())
         self.server.on_client_connect(lambda _: self._go_to_camera())
-        swap.on_click(lambda _: self._swap())
+        self.swap.on_click(lambda _: self._swap())
         picture.on_click(lambda event: self._screenshot(event.client))
 
     def _layer(self) -> Layer:

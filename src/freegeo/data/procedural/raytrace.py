@@ -32,8 +32,8 @@ GRAIN_CELLS = 96
 
 _NEAREST = 1e-3
 _TINY = 1e-8
-_RAYS_PER_CHUNK_CPU = 1 << 16  # the working set of a chunk stays in the processor's cache
-_RAYS_PER_CHUNK_CUDA = 1 << 24
+RAYS_PER_CHUNK_CPU = 1 << 16  # the working set of a chunk stays in the processor's cache
+RAYS_PER_CHUNK_CUDA = 1 << 24
 
 
 class RenderedViews(NamedTuple):
@@ -81,7 +81,7 @@ def render(
     T_cam_room = rooms.T_cam_room[:, views].flatten(0, 1)
     scene = torch.arange(len(rooms), device=rooms.device).repeat_interleave(len(views))
     bank = texture_bank(rooms.domain.bank, str(rooms.device))
-    budget = _RAYS_PER_CHUNK_CUDA if rooms.device.type == "cuda" else _RAYS_PER_CHUNK_CPU
+    budget = RAYS_PER_CHUNK_CUDA if rooms.device.type == "cuda" else RAYS_PER_CHUNK_CPU
     chunk = max(1, budget // (height * width * supersample**2))
     for part in (slice(start, start + chunk) for start in range(0, count, chunk)):
         size = (height * supersample, width * supersample)
