@@ -12,12 +12,12 @@ from exact_rooms import PHOTO_SCALE, room
 from freegeo.data.procedural import render, sample_rooms
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.depth_png import depth_names, write_depth
-from freegeo.export.formats import WRITERS, export, filter_reconstruction
+from freegeo.export.formats import FORMATS, export, filter_reconstruction
 from freegeo.export.mesh import fuse, voxel_size, write_mesh
 from freegeo.export.nerfstudio import opengl_camera_to_world
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.fusion.filtering import FilterSettings
+from freegeo.fusion.settings import FilterSettings
 from freegeo.geometry.depth import depth_to_world
 
 EVERYTHING = FilterSettings(drop_share=0, flying=False, multi_view=False)
@@ -26,7 +26,7 @@ EVERYTHING = FilterSettings(drop_share=0, flying=False, multi_view=False)
 def test_every_format_is_written_once_and_points_are_shared(tmp_path):
     pytest.importorskip("pycolmap", reason="needs the extra colmap")
     scene = room()
-    written = export(scene, tmp_path, [*WRITERS, "ply"], max_points=500, max_tracks=100)
+    written = export(scene, tmp_path, [*FORMATS, "ply"], max_points=500, max_tracks=100)
     assert len(set(written)) == len(written)
     assert all(path.is_file() for path in written)
     on_disk = {p.relative_to(tmp_path) for p in tmp_path.rglob("*") if p.is_file()}
