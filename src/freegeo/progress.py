@@ -26,7 +26,7 @@ def progress_bar(title: str, total: int) -> Generator[Update]:
 
     `text` stands behind the numbers until another one is given.
     """
-    if not (sys.stderr.isatty() or _in_notebook()):
+    if not (sys.stderr.isatty() or in_notebook()):
         yield _lines(title, total)
         return
     from rich.console import Console
@@ -77,7 +77,7 @@ def step_bar(then: Callable[[Progress], None] = lambda progress: None) -> Genera
         yield on_step
 
 
-def _in_notebook() -> bool:
+def in_notebook() -> bool:
     """Whether rich can draw a bar below a notebook's cell, for which it needs ipywidgets."""
     if "IPython" not in sys.modules or find_spec("ipywidgets") is None:
         return False

@@ -36,6 +36,34 @@ def test_every_format_is_written_once_and_points_are_shared(tmp_path):
     np.testing.assert_array_equal(Reconstruction.load(tmp_path).depth_z, scene.depth_z)
 
 
+def test_all_stands_for_every_format_and_each_is_where_it_says(tmp_path):
+    pytest.importorskip("pycolmap", reason="needs the extra colmap")
+    written = room().export(str(tmp_path), ["ply", "all"], max_points=100, max_tracks=50)
+    for format in FORMATS.values():
+        place = tmp_path / format.path
+        assert any(path == place or place in path.parents for path in written), format.name
+
+
+def test_only_formats_without_points_can_do_without_cameras(tmp_path):
+    flat = replace(room(), T_cam_world=None, K=None)
+    for format in FORMATS.values():
+        if format.needs_cameras:
+            with pytest.raises(UserError, match="no cameras"):
+                flat.export(tmp_path, [format.name])
+        else:
+            assert flat.export(tmp_path / format.name, [format.name])
+
+
+def test_a_reconstruction_exports_what_its_filters_and_masks_leave(tmp_path):
+    scene = room()
+    masks = [np.zeros(tuple(hw), np.uint8) for hw in scene.photo_hw]
+    masks[1][20:40, 20:40] = 1
+    assert room().export(tmp_path / "default") == [tmp_path / "default" / n for n in ("points.ply", "scene.glb")]
+    scene.export(tmp_path, ["ply"], filters=EVERYTHING, masks=masks)
+    kept, _ = filter_reconstruction(scene, masks=masks_for_model(scene, masks), settings=EVERYTHING)
+    assert 0 < len(trimesh.load(tmp_path / "points.ply").vertices) == kept.sum() < kept.size / 10
+
+
 def test_filters_decide_what_is_exported(tmp_path):
     scene = room()
     masks = np.zeros(scene.depth_z.shape, bool)

@@ -35,6 +35,7 @@ COMMANDS = {
     "run": ("freegeo.cli.run:run", "Photos in, adapted reconstruction out."),
     "adapt": ("freegeo.cli.adapt:adapt", "Adapt a model to one or several scenes and save the adapter."),
     "reconstruct": ("freegeo.cli.reconstruct:reconstruct", "Reconstruct with a frozen model or a saved adapter."),
+    "adapter": ("freegeo.cli.adapter:app", "Fold a saved adapter into the weights of its model."),
     "export": ("freegeo.cli.export:export", "Write a reconstruction in other tools' formats."),
     "view": ("freegeo.cli.view:view", "Look at results in the browser, before and after adaptation."),
     "bench": ("freegeo.cli.bench:app", "Published evaluation: datasets, tables, comparison with the paper."),
