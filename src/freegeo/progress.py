@@ -56,6 +56,8 @@ def progress_bar(title: str, total: int) -> Generator[Update]:
                 bar.update(task, text=text)
 
         yield update
+        # In a notebook rich stops without drawing the last state.
+        bar.refresh()
 
 
 @contextmanager

@@ -199,8 +199,8 @@ def test_adapters_that_cannot_be_used(freegeo, photo_folder, tiny, tmp_path, kin
         adapter.mkdir()
     if kind == "another model":
         assert freegeo("adapt", photo_folder, "-o", adapter, *tiny, *QUICK).code == 0
-        page = adapter / "freegeo.json"
-        page.write_text(page.read_text().replace("freegeo-tiny", "da3-base"))
+        metadata = adapter / "freegeo.json"
+        metadata.write_text(metadata.read_text().replace("freegeo-tiny", "da3-base"))
     outcome = freegeo("reconstruct", photo_folder, "-o", tmp_path / "out", *tiny, "--adapter", adapter)
     assert outcome.code == 2
     expected = "made for da3-base, not for freegeo-tiny" if kind == "another model" else "not an adapter folder"

@@ -185,7 +185,7 @@ class Reconstruction:
 
         Args:
             folder: where they appear.
-            formats: one or several of npz, ply, glb, mesh, colmap, nerfstudio, depth; or all.
+            formats: names of `freegeo.export.formats.FORMATS`, or all.
             filters: which points are kept; None: the defaults of `FilterSettings`.
             masks: one (H, W) array per photo at its size, not zero where points are wanted.
             max_points: of `points.ply` and `scene.glb`; None writes all.
