@@ -117,7 +117,7 @@ def _applied(model: ReconstructionModel, adapter: Adapter | str | Path | None) -
 
 @contextmanager
 def _loaded(model: ReconstructionModel, folder: str | Path) -> Generator[None]:
-    adapter = adapter_files.load_adapter(model, folder)
+    adapter = load_adapter(model, folder)
     try:
         yield
     finally:
@@ -130,7 +130,7 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
     UserError when the folder holds no adapter, when it was made for another model, or when the model carries one.
     """
     _require_model(model)
-    return adapter_files.load_adapter(model, folder)
+    return adapter_files.load_adapter(model, Path(folder).expanduser())
 
 
 def adapt(
