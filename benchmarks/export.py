@@ -14,9 +14,10 @@ import torch
 from record import write_result
 
 from freegeo.data.procedural import render, sample_rooms
-from freegeo.export.formats import MAX_TRACKS, WRITERS, export, filter_reconstruction
+from freegeo.export.base import MAX_TRACKS
+from freegeo.export.formats import FORMATS, export, filter_reconstruction
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.fusion.filtering import FilterSettings
+from freegeo.fusion.settings import FilterSettings
 
 PHOTO_SCALE = 4
 
@@ -56,14 +57,14 @@ def main() -> None:
 
     small = room(2, 56, options.seed)
     with tempfile.TemporaryDirectory() as folder:
-        export(small, folder, list(WRITERS))  # imports and first calls are not what is measured
+        export(small, folder, list(FORMATS))  # imports and first calls are not what is measured
 
     scene = room(options.views, options.side, options.seed)
     _, filtering = measured(lambda: filter_reconstruction(scene))
     everything = filter_reconstruction(scene, settings=FilterSettings(drop_share=0, flying=False, multi_view=False))
     formats = {}
     with tempfile.TemporaryDirectory() as folder:
-        for name in WRITERS:
+        for name in FORMATS:
             paths, seconds = measured(lambda name=name: export(scene, Path(folder) / name, [name], filtered=everything))
             megabytes = sum(path.stat().st_size for path in paths) / 1e6
             formats[name] = seconds | {"megabytes": round(megabytes, 1)}

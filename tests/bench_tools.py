@@ -5,8 +5,8 @@ from functools import cache
 from freegeo.benchmark.stored import write_stored
 from freegeo.benchmark.tasks import Task, choose_frames, finish
 from freegeo.data.datasets.registry import load_scene
+from freegeo.data.photos import MemoryPhoto
 from freegeo.data.procedural import render, sample_rooms
-from freegeo.data.procedural.photographs import RenderedPhoto
 from freegeo.data.scene import Scene
 from freegeo.types import Prediction
 
@@ -22,7 +22,7 @@ def small_room(seed: int, domain: str, frames: int) -> Scene:
     images = [(image.permute(1, 2, 0) * 255).round().byte().numpy() for image in views.images[0]]
     return Scene(
         name=str(seed),
-        photos=tuple(RenderedPhoto(f"{i:02d}.png", image) for i, image in enumerate(images)),
+        photos=tuple(MemoryPhoto(f"{i:02d}.png", image) for i, image in enumerate(images)),
         T_cam_world=views.T_cam_world[0],
         K=views.K[0],
         depth_z=views.depth_z[0],

@@ -9,7 +9,8 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "src" / "freegeo"
 ANYWHERE = {"types", "errors", "files", "run_folder", "__init__"}
 ALLOWED = {
-    "pipeline": {"models", "data", "adaptation", "fusion", "export", "report", "metrics", "geometry"},
+    "pipeline": {"models", "data", "adaptation", "fusion", "export", "report", "metrics", "geometry", "progress"},
+    "progress": {"adaptation"},
     "benchmark": {"adaptation", "models", "data", "fusion", "metrics", "geometry"},
     "training": {"models", "data", "metrics", "geometry"},
     "adaptation": {"models", "data.scene", "geometry"},

@@ -1,85 +1,295 @@
-"""The pipeline as a library: predictions in chunks, adaptation by name, and the pieces of a summary."""
+"""The Python interface: what it takes, what it returns, and that it leaves the model as it was."""
+
+import io
+import logging
+from contextlib import redirect_stderr, redirect_stdout
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+import freegeo
 from freegeo import pipeline
+from freegeo.adaptation.adapter import Adapter, is_adapted
+from freegeo.adaptation.recipe import PAPER
 from freegeo.errors import UserError
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.types import ImageBatch
-from tiny_models import noise, quick, tiny_da3
+from freegeo.models import api
+from tiny_models import noise, quick, same, tensors, tiny_da3, trained
+
+VIEWS, SIDE = 4, 32
+QUICK = {"steps": 2, "sets": 2}
 
 
-def batch(views: int) -> ImageBatch:
-    return ImageBatch(
-        images=noise(views),
-        names=tuple(map(str, range(views))),
-        photo_hw=torch.full((views, 2), 32),
-        scale_xy=torch.ones(views, 2, dtype=torch.float64),
-        offset_xy=torch.zeros(views, 2, dtype=torch.float64),
-    )
+def pictures(views: int = VIEWS, seed: int = 0) -> list[np.ndarray]:
+    return list((noise(views, seed).permute(0, 2, 3, 1) * 255).round().byte().numpy())
 
 
 @pytest.fixture
-def model(monkeypatch):
-    """A model of a few thousand parameters that takes a batch for photos."""
-    model = tiny_da3()
-    monkeypatch.setattr(model, "preprocess", lambda photos: photos)
-    return model
+def model():
+    return tiny_da3()
+
+
+@pytest.fixture
+def saved(model, tmp_path):
+    """A folder with an adapter that changes much; the model is as before."""
+    from freegeo.adaptation.adapter_files import save_adapter
+
+    adapter = trained(model)
+    save_adapter(adapter, tmp_path / "adapter", {})
+    adapter.detach()
+    return tmp_path / "adapter"
+
+
+def state(model) -> tuple[list[str], list[torch.Tensor], bool]:
+    """What must be as before: names and values of everything on the model, and whether an adapter is on."""
+    values = model.state_dict()
+    return list(values), [value.clone() for value in values.values()], is_adapted(model)
+
+
+def unchanged(model, before) -> bool:
+    names, values, on = state(model)
+    return names == before[0] and on == before[2] and same(values, before[1])
 
 
 def close(one: Reconstruction, two: Reconstruction) -> bool:
     return np.allclose(one.depth_z, two.depth_z, atol=1e-5)
 
 
+# -- reconstruct
+
+
 def test_embedding_in_chunks_changes_nothing(model, monkeypatch):
-    whole = pipeline.predict(model, batch(5))
-    monkeypatch.setattr(pipeline, "VIEWS_PER_CHUNK", 2)
-    parts = pipeline.predict(model, batch(5))
+    whole = freegeo.reconstruct(model, pictures(5), device="cpu")
+    monkeypatch.setattr(api, "views_per_chunk", lambda device: 2)
+    parts = freegeo.reconstruct(model, pictures(5), device="cpu")
     assert close(whole, parts)
-    assert parts.names == tuple("01234")
+    assert parts.names == tuple(f"image-{k:03d}" for k in range(5))
     assert whole.T_cam_world is not None and parts.T_cam_world is not None
     assert np.allclose(whole.T_cam_world, parts.T_cam_world, atol=1e-5)
 
 
-def test_adapted_model_sees_from_the_first_view_and_detaching_restores(model):
-    photos = batch(4)
-    before = pipeline.reconstruct(model, photos)
-    result = pipeline.adapt(model, photos, recipe=quick(model))
-    assert len(result.curve) == 4
-    after = pipeline.reconstruct(model, photos, adapter=result.adapter)
-    assert not close(before, after)
-    with result.adapter.off():
-        assert close(before, pipeline.reconstruct(model, photos))
-    result.adapter.detach()
-    assert close(before, pipeline.reconstruct(model, photos))
+def test_an_adapter_is_used_however_it_is_given(model, saved):
+    frozen, before = freegeo.reconstruct(model, pictures()), state(model)
+    adapted = freegeo.reconstruct(model, pictures(), adapter=str(saved))
+    assert not close(frozen, adapted)
+    assert unchanged(model, before)
+    assert close(adapted, freegeo.reconstruct(model, pictures(), adapter=saved))
+
+    adapter = freegeo.load_adapter(model, saved)
+    attached = state(model)
+    for given in (adapter, None):
+        assert close(adapted, freegeo.reconstruct(model, pictures(), adapter=given))
+        assert unchanged(model, attached)
+    with adapter.off():
+        off = state(model)
+        assert close(frozen, freegeo.reconstruct(model, pictures()))
+        assert close(adapted, freegeo.reconstruct(model, pictures(), adapter=adapter))
+        assert unchanged(model, off)
+    assert unchanged(model, attached)
+
+    adapter.detach()
+    assert close(frozen, freegeo.reconstruct(model, pictures()))
+    assert close(adapted, freegeo.reconstruct(model, pictures(), adapter=adapter))
+    assert unchanged(model, before)
 
 
-def test_reference_of_an_adapter_may_be_chosen(model, monkeypatch):
+def test_the_model_is_as_before_when_something_fails(model, saved):
+    adapter = freegeo.load_adapter(model, saved)
+    adapter.detach()
+    before = state(model)
+    for given in (adapter, saved):
+        with pytest.raises(UserError, match="sideways"):
+            freegeo.reconstruct(model, pictures(), adapter=given, reference="sideways")
+        assert unchanged(model, before)
+
+
+def test_an_adapter_looks_from_the_first_view(model, saved, monkeypatch):
     asked = []
     plain = model.aggregate
     monkeypatch.setattr(
         model, "aggregate", lambda tokens, **options: (asked.append(options["reference"]), plain(tokens, **options))[1]
     )
-    pipeline.reconstruct(model, batch(3), adapter=object())
-    pipeline.reconstruct(model, batch(3), adapter=object(), reference="middle")
-    pipeline.reconstruct(model, batch(3))
-    assert asked == ["first", "middle", model.spec.reference]
+    model.spec = type(model.spec)(**{**vars(model.spec), "reference": "middle"})
+    freegeo.reconstruct(model, pictures())
+    freegeo.reconstruct(model, pictures(), adapter=saved)
+    freegeo.reconstruct(model, pictures(), adapter=saved, reference="saddle_balanced")
+    adapter = freegeo.load_adapter(model, saved)
+    freegeo.reconstruct(model, pictures())
+    with adapter.off():
+        freegeo.reconstruct(model, pictures())
+    assert asked == ["middle", "first", "saddle_balanced", "first", "middle"]
+
+
+def test_adapters_that_cannot_be_used(model, saved, tmp_path):
+    other = trained(tiny_da3(seed=1))
+    with pytest.raises(UserError, match=r"Adapter\(tiny-da3, rank 4, on\) belongs to another model"):
+        freegeo.reconstruct(model, pictures(), adapter=other)
+    with pytest.raises(UserError, match="not an adapter folder"):
+        freegeo.reconstruct(model, pictures(), adapter=tmp_path)
+    with pytest.raises(UserError, match="not dict"):
+        freegeo.reconstruct(model, pictures(), adapter={})
+    adapter = freegeo.load_adapter(model, saved)
+    with pytest.raises(UserError, match="already carries an adapter; detach it first"):
+        freegeo.reconstruct(model, pictures(), adapter=saved)
+    adapter.merge()
+    with pytest.raises(UserError, match="was merged"):
+        freegeo.reconstruct(model, pictures(), adapter=adapter)
+
+
+def test_a_model_is_asked_for_in_one_sentence(saved):
+    for call in (freegeo.reconstruct, freegeo.adapt, freegeo.load_adapter):
+        with pytest.raises(UserError, match=r"not str\. Load it with freegeo\.load_model\('da3-base'\)\.$"):
+            call("da3-base", saved)
+    with pytest.raises(UserError, match="not NoneType"):
+        freegeo.reconstruct(None, pictures())
+
+
+def test_photos_are_whatever_load_photos_takes(model, tmp_path):
+    for k, pixels in enumerate(pictures()):
+        Image.fromarray(pixels).save(tmp_path / f"{k}.png")
+    wanted = freegeo.reconstruct(model, pictures())
+    files = sorted(tmp_path.iterdir())
+    images = [Image.open(file) for file in files]
+    for given in (tmp_path, str(tmp_path), f"{tmp_path}/*.png", files, images, freegeo.load_photos(tmp_path)):
+        assert close(wanted, freegeo.reconstruct(model, given))
+    assert len(freegeo.reconstruct(model, tmp_path, max_views=2)) == 2
+    with pytest.raises(UserError, match="no photos found"):
+        freegeo.reconstruct(model, [])
+
+
+def test_the_device_is_the_best_at_hand_unless_one_is_named(model, monkeypatch):
+    asked = []
+    monkeypatch.setattr(pipeline.Compute, "choose", lambda *wanted: (asked.append(wanted), pipeline.CPU)[1])
+    freegeo.reconstruct(model, pictures())
+    freegeo.adapt(model, pictures(), device="cpu", precision="fp32", **QUICK)
+    assert asked == [(None, None), ("cpu", "fp32")]
+
+
+# -- adapt
+
+
+def test_adapting_keeps_the_adapter_on_until_it_is_detached(model):
+    before = freegeo.reconstruct(model, pictures())
+    result = freegeo.adapt(model, pictures(), recipe=quick(model))
+    assert len(result.curve) == 4
+    after = freegeo.reconstruct(model, pictures())
+    assert not close(before, after)
+    with result.adapter.off():
+        assert close(before, freegeo.reconstruct(model, pictures()))
+    result.adapter.detach()
+    assert close(before, freegeo.reconstruct(model, pictures()))
+    result.adapter.reattach()
+    assert close(after, freegeo.reconstruct(model, pictures()))
+
+
+def test_settings_reach_the_recipe_as_on_the_command_line(model):
+    result = freegeo.adapt(
+        model, pictures(), steps=3, sets=2, lr=1e-4, rank=2, hold=0.5, views=4, keep=[0, 2],
+        loss={"weight_kq": 0.0, "num_query": 5}, seed=7,
+    )  # fmt: skip
+    recipe = result.recipe
+    assert (recipe.name, recipe.steps, recipe.sets_per_scene, recipe.lr) == ("scene", 3, 2, 1e-4)
+    assert (recipe.rank, recipe.alpha, recipe.hold, recipe.views, recipe.keep) == (2, 2, 0.5, 4, (0, 2))
+    assert (recipe.loss.weight_kq, recipe.loss.num_query, recipe.loss.num_reference) == (0.0, 5, 256)
+    assert result.seed == 7
+    assert len(result.curve) == 3
+
+
+def test_recipes_by_name_and_by_hand(model):
+    named = freegeo.adapt(model, pictures(), recipe="paper", dataset="eth3d", epochs=1, sets=1)
+    assert (named.recipe.name, named.recipe.epochs, named.recipe.batch) == ("paper", 1, PAPER.batch)
+    named.adapter.detach()
+    for recipe, words in (("best", "unknown recipe 'best'"), (3, "not int"), ("paper", "choose --dataset")):
+        with pytest.raises(UserError, match=words):
+            freegeo.adapt(model, pictures(), recipe=recipe)
+    with pytest.raises(UserError, match="given by name"):
+        freegeo.adapt(model, pictures(), recipe=quick(model), dataset="eth3d")
+
+
+def test_a_recipe_that_squashes_reads_the_photos_itself(model):
+    plain = freegeo.adapt(model, pictures(), recipe=quick(model))
+    plain.adapter.detach()
+    squashed = freegeo.adapt(model, pictures(), recipe=quick(model, squash=16))
+    assert not same(tensors(plain), tensors(squashed))
 
 
 @pytest.mark.parametrize("views", [1, 2])
 def test_too_few_photos_to_hold_one_out(model, views):
     with pytest.raises(UserError, match=f"needs at least 3 photos, got {views}"):
-        pipeline.adapt(model, batch(views))
-    assert pipeline.reconstruct(model, batch(views)).depth_z.shape == (views, 32, 32)
+        freegeo.adapt(model, pictures(views))
+    assert freegeo.reconstruct(model, pictures(views)).depth_z.shape == (views, SIDE, SIDE)
 
 
-@pytest.mark.parametrize(
-    ("totals", "first", "last"), [([3.0], 3.0, 3.0), ([4.0, 2.0], 4.0, 2.0), ([4.0, 2.0] * 10, 3.0, 3.0)]
-)
-def test_loss_change_is_of_the_first_and_last_tenth(totals, first, last):
-    assert pipeline.loss_change(totals) == {"first": first, "last": last}
+def test_a_run_that_was_stopped_continues(model, tmp_path, monkeypatch):
+    from freegeo.adaptation import adapt as adapting
+
+    monkeypatch.setattr(adapting, "SAVE_EVERY_S", -1.0)
+    whole = freegeo.adapt(model, pictures(), steps=4, sets=2)
+    whole.adapter.detach()
+    steps = []
+
+    def stop(progress):
+        steps.append(progress.step)
+        if progress.step == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        freegeo.adapt(model, pictures(), steps=4, sets=2, resume_in=str(tmp_path), on_step=stop)
+    rest = freegeo.adapt(model, pictures(), steps=4, sets=2, resume_in=tmp_path, on_step=lambda p: steps.append(p.step))
+    assert steps == [0, 1, 2, 2, 3]
+    assert same(tensors(whole), tensors(rest))
+    rest.save(str(tmp_path))
+    assert (tmp_path / "freegeo.json").is_file()
+    assert not (tmp_path / adapting.UNFINISHED_FILE).exists()
+
+
+def test_nothing_is_shown_unless_it_is_asked_for(model, monkeypatch):
+    shown, steps = io.StringIO(), []
+    # Commands that ran in this process have left their handler.
+    monkeypatch.setattr(logging.getLogger("freegeo"), "handlers", [])
+    with redirect_stdout(shown), redirect_stderr(shown):
+        freegeo.adapt(model, pictures(), **QUICK).adapter.detach()
+        freegeo.reconstruct(model, pictures())
+        assert shown.getvalue() == ""
+        freegeo.adapt(model, pictures(), progress=True, on_step=lambda p: steps.append(p.step), **QUICK)
+    assert shown.getvalue().splitlines()[-1].startswith("adapting: 2/2")
+    assert "loss " in shown.getvalue()
+    assert steps == [0, 1]
+
+
+# -- results
+
+
+def test_results_describe_themselves_in_one_line(model, tmp_path):
+    result = freegeo.adapt(model, pictures(), **QUICK)
+    change = result.loss_change()
+    expected = (
+        f"Adapted(scene recipe, 2 steps, loss {change['first']:.4g} -> {change['last']:.4g}, {result.seconds:.0f} s)"
+    )
+    assert repr(result) == expected
+    found = freegeo.reconstruct(model, pictures())
+    assert repr(found) == f"Reconstruction({VIEWS} views, {SIDE} x {SIDE} pixels, cameras)"
+    adapter: Adapter = result.adapter
+    assert repr(adapter) == "Adapter(tiny-da3, rank 4, on)"
+    adapter.set_strength(0.5)
+    with adapter.off():
+        assert repr(adapter) == "Adapter(tiny-da3, rank 4, off, strength 0.5)"
+    adapter.detach()
+    assert repr(adapter) == "Adapter(tiny-da3, rank 4, detached, strength 0.5)"
+    adapter.merge()
+    assert repr(adapter) == "Adapter(tiny-da3, rank 4, merged, strength 0.5)"
+
+
+def test_results_are_stored_and_opened(model, tmp_path):
+    found = freegeo.reconstruct(model, pictures())
+    found.save(tmp_path)
+    opened = freegeo.open_reconstruction(str(tmp_path))
+    assert np.array_equal(opened.depth_z, found.depth_z)
+    assert opened.names == found.names
+    with pytest.raises(UserError, match="holds no reconstruction"):
+        freegeo.open_reconstruction(tmp_path / "nowhere")
 
 
 def test_settings_spell_the_recipe_out(model):

@@ -1,12 +1,12 @@
-"""Photos -> adapter -> reconstruction folder: what `freegeo run` does, importable."""
+"""Photos -> adapter -> reconstruction: the public functions, and what `freegeo run` does with a folder (`Job`)."""
 
 from __future__ import annotations
 
-import logging
 import platform
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,35 +14,37 @@ import numpy as np
 import torch
 
 from freegeo import __version__
+from freegeo.adaptation import adapter_files
 from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapt import Adapted, Progress, loss_change
 from freegeo.adaptation.adapt import adapt as train_adapter
-from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.adapter_files import METADATA, load_adapter
+from freegeo.adaptation.adapter import Adapter, is_adapted
+from freegeo.adaptation.adapter_files import METADATA
 from freegeo.adaptation.memory import plan_reconstruction
 from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Recipe
 from freegeo.adaptation.samples import SceneImages
+from freegeo.data.photos import MAX_VIEWS, load_photos
 from freegeo.errors import UserError
+from freegeo.export.base import DEFAULT_FORMATS
 from freegeo.export.formats import export, filter_reconstruction
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import FILE_NAME as PREDICTION_NAME
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import FORMAT, read_json, write_json
-from freegeo.fusion.filtering import FilterReport, FilterSettings
-from freegeo.models.api import embed_in_chunks
+from freegeo.fusion.filtering import FilterReport
+from freegeo.fusion.settings import FilterSettings
+from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.precision import Compute
+from freegeo.progress import step_bar
 from freegeo.report.page import write_report
 from freegeo.run_folder import RunFolder
 from freegeo.types import ImageBatch, PhotoLike
 
 if TYPE_CHECKING:
-    from freegeo.models.api import ReconstructionModel
-
-logger = logging.getLogger(__name__)
+    from freegeo.data.photos import PhotoSource
 
 SUMMARY_NAME = "reconstruction.json"
 FROZEN_FOLDER, ADAPTER_FOLDER = "frozen", "adapter"
-FORMATS = ("ply", "glb")
 CPU = Compute()
 
 
@@ -50,48 +52,179 @@ CPU = Compute()
 def predict(
     model: ReconstructionModel, batch: ImageBatch, *, reference: str | None = None, compute: Compute = CPU
 ) -> Reconstruction:
-    """Reconstruct prepared images; an adapter that is in place is used as it stands.
+    """Reconstruct prepared images with the model as it stands.
 
-    `reference` None takes the model's own rule. UserError when the images do not fit into memory together.
+    `reference` None is the first view when an adapter is on, as in adaptation, else the model's own rule. UserError
+    when the images do not fit into memory together.
     """
+    reference = reference or ("first" if is_adapted(model) else model.spec.reference)
     plan_reconstruction(model, len(batch), batch.image_hw, compute=compute)
     model.to(compute.device).eval()
     with compute.autocast():
         tokens = embed_in_chunks(model, batch.images, device=compute.device)
-        features = model.aggregate(tokens, reference=reference or model.spec.reference)
+        features = model.aggregate(tokens, reference=reference)
     return Reconstruction.from_prediction(model.decode(features), batch)
 
 
 def reconstruct(
-    model: ReconstructionModel, photos: Sequence[PhotoLike], *, adapter: Adapter | None = None, **options: Any
+    model: ReconstructionModel,
+    photos: PhotoSource,
+    *,
+    adapter: Adapter | str | Path | None = None,
+    reference: str | None = None,
+    device: str | None = None,
+    precision: str | None = None,
+    max_views: int = MAX_VIEWS,
 ) -> Reconstruction:
     """Reconstruct photos: depth, confidence and cameras of every view.
 
-    With an `adapter` (already in place on the model) the first view is the reference, as in adaptation. `options` are
-    those of `predict`.
+    Args:
+        model: from `freegeo.load_model`; it is moved to the device.
+        photos: what `freegeo.load_photos` takes or returned.
+        adapter: an adapter of this model, or the folder of a saved one; it is used for this call, and the model is left
+            as it was. None: the model as it stands, with the adapter that is in place on it, if there is one.
+        reference: rule of the reference view; None: the first view with an adapter, as in adaptation, else the model's.
+        device: cpu, cuda, cuda:N or mps; None: the best at hand.
+        precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
+        max_views: most photos that are used; a list that `freegeo.load_photos` returned is used as it is.
+
+    Raises:
+        UserError: an argument that cannot be used, or views that do not fit into memory together.
     """
-    if adapter is not None:
-        options.setdefault("reference", "first")
-    return predict(model, model.preprocess(photos), **options)
+    _require_model(model)
+    compute = Compute.choose(device, precision)
+    batch = model.preprocess(load_photos(photos, max_views))
+    with _applied(model, adapter):
+        return predict(model, batch, reference=reference, compute=compute)
+
+
+def _applied(model: ReconstructionModel, adapter: Adapter | str | Path | None) -> AbstractContextManager[None]:
+    """Return a context in which an adapter is on; afterwards the model is as it was."""
+    if adapter is None:
+        return nullcontext()
+    if isinstance(adapter, str | Path):
+        return _loaded(model, adapter)
+    if not isinstance(adapter, Adapter):
+        given = type(adapter).__name__
+        raise UserError(f"adapter is an Adapter (such as result.adapter) or the folder of a saved one, not {given}.")
+    if adapter.model is not model.adaptable():
+        raise UserError(
+            f"{adapter} belongs to another model than the one given. Give that model, or save the adapter and load it "
+            "with freegeo.load_adapter."
+        )
+    return adapter.applied()
+
+
+@contextmanager
+def _loaded(model: ReconstructionModel, folder: str | Path) -> Generator[None]:
+    adapter = load_adapter(model, folder)
+    try:
+        yield
+    finally:
+        adapter.detach()
+
+
+def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
+    """Put a saved adapter on a model, on; `adapter.detach()` takes it out and `adapter.reattach()` puts it back.
+
+    UserError when the folder holds no adapter, when it was made for another model, or when the model carries one.
+    """
+    _require_model(model)
+    return adapter_files.load_adapter(model, Path(folder).expanduser())
 
 
 def adapt(
     model: ReconstructionModel,
-    photos: Sequence[PhotoLike],
+    photos: PhotoSource,
     *,
     recipe: str | Recipe = "scene",
+    dataset: str | None = None,
+    steps: int | None = None,
+    epochs: int | None = None,
+    lr: float | None = None,
+    rank: int | None = None,
+    hold: float | None = None,
+    views: int | None = None,
+    keep: Sequence[int] | None = None,
+    sets: int | None = None,
+    loss: Mapping[str, Any] | None = None,
     seed: int = SEED,
-    compute: Compute = CPU,
-    **options: Any,
+    device: str | None = None,
+    precision: str | None = None,
+    max_views: int = MAX_VIEWS,
+    resume_in: str | Path | None = None,
+    progress: bool = False,
+    on_step: Callable[[Progress], None] = lambda progress: None,
 ) -> Adapted:
     """Adapt a model to one scene's photos; the adapter stays in place (`result.adapter.detach()` takes it out).
 
-    `options` are those of `freegeo.adaptation.adapt.adapt`. UserError for fewer than 3 photos.
+    Settings left at None are those of the recipe; they mean what the options of `freegeo adapt` mean.
+
+    Args:
+        model: from `freegeo.load_model`, without an adapter; it is moved to the device.
+        photos: at least 3; what `freegeo.load_photos` takes or returned.
+        recipe: `scene`, `paper`, `released-da3`, `released-vggt`, or a recipe of your own.
+        dataset: whose published settings the last three of these names take.
+        steps: optimiser steps.
+        epochs: passes over all view sets, instead of steps.
+        lr: peak learning rate.
+        rank: rank of the adapter.
+        hold: weight of keeping what the model says with all views as it is.
+        views: views the teacher sees.
+        keep: positions among them that the student keeps, such as `(0, 2, 4, 6)`.
+        sets: view sets per scene.
+        loss: settings of the loss, such as `{"weight_kq": 0.0}`.
+        seed: of everything random.
+        device: cpu, cuda, cuda:N or mps; None: the best at hand.
+        precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
+        max_views: most photos that are used; a list that `freegeo.load_photos` returned is used as it is.
+        resume_in: folder for the state of an unfinished run: the same call continues it. `result.save` to that folder
+            removes the state.
+        progress: show a bar in a terminal or notebook, lines in a log file; without it nothing is printed.
+        on_step: called after every step.
+
+    Raises:
+        UserError: an argument that cannot be used, fewer than 3 photos, or a run that does not fit into memory.
+        FreeGeoError: a loss or gradient that is not finite.
     """
-    require_enough_photos(photos)
-    plan = recipes.named(recipe, model.spec) if isinstance(recipe, str) else recipe
-    scene = SceneImages.from_batch("photos", model.preprocess(photos))
-    return train_adapter(model, [scene], plan, seed=seed, compute=compute, **options)
+    _require_model(model)
+    compute = Compute.choose(device, precision)
+    plan = _recipe(recipe, model, dataset).changed(
+        steps=steps, epochs=epochs, lr=lr, rank=rank, hold=hold, views=views,
+        keep=None if keep is None else tuple(keep), sets_per_scene=sets, loss=loss,
+    )  # fmt: skip
+    found = load_photos(photos, max_views)
+    require_enough_photos(found)
+    scene = scene_images("photos", found, model, plan, model.preprocess(found))
+    folder = None if resume_in is None else Path(resume_in).expanduser()
+    with step_bar(on_step) if progress else nullcontext(on_step) as follow:
+        return train_adapter(model, [scene], plan, seed=seed, compute=compute, resume_in=folder, on_step=follow)
+
+
+def _recipe(recipe: str | Recipe, model: ReconstructionModel, dataset: str | None) -> Recipe:
+    if isinstance(recipe, str):
+        return recipes.named(recipe, model.spec, dataset)
+    if not isinstance(recipe, Recipe):
+        raise UserError(f"recipe is a name such as 'scene', or a Recipe, not {type(recipe).__name__}.")
+    if dataset is not None:
+        raise UserError("dataset chooses the settings of a recipe that is given by name; change the recipe instead.")
+    return recipe
+
+
+def _require_model(model: object) -> None:
+    if isinstance(model, ReconstructionModel):
+        return
+    hint = f"freegeo.load_model({model!r})" if isinstance(model, str) else "freegeo.load_model"
+    raise UserError(f"model is a loaded model, not {type(model).__name__}. Load it with {hint}.")
+
+
+def scene_images(
+    name: str, photos: Sequence[PhotoLike], model: ReconstructionModel, recipe: Recipe, batch: ImageBatch
+) -> SceneImages:
+    """Return photos as a scene to adapt to: `batch` as it is, or what a recipe that resizes by itself makes of them."""
+    if recipe.squash is None:
+        return SceneImages.from_batch(name, batch)
+    return SceneImages.from_photos(name, photos, model, recipe)
 
 
 def require_enough_photos(photos: Sequence[PhotoLike]) -> None:
@@ -121,15 +254,15 @@ class Job:
     recipe: Recipe | None
     """None: reconstruct with the frozen model, or with `adapter`."""
     scene: SceneImages | None = None
-    """Images to adapt to, where the recipe reads them otherwise than `batch` has them."""
+    """What is adapted to (`scene_images`); needed with a recipe."""
     adapter: Path | None = None
     """A saved adapter to reconstruct with, instead of training one."""
     seed: int = SEED
     compute: Compute = CPU
     reference: str | None = None
     """Reference-view rule of the frozen model; None: the model's own."""
-    formats: Sequence[str] = FORMATS
-    """Files to write besides the predictions, names of `freegeo.export.formats.WRITERS`."""
+    formats: Sequence[str] = DEFAULT_FORMATS
+    """Files to write besides the predictions, names of `freegeo.export.formats.FORMATS`."""
     filters: FilterSettings = field(default_factory=FilterSettings)
     masks: list[np.ndarray] | None = None
     """One (H, W) array per photo at its size, not zero where points are wanted."""
@@ -144,16 +277,15 @@ class Job:
 
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
+        # Whether the views fit is asked before an adapter is trained for them.
         plan_reconstruction(self.model, len(self.batch), self.batch.image_hw, compute=self.compute)
         frozen = None
         if self.recipe is not None:
-            frozen = self._predicted(self.folder / FROZEN_FOLDER, "frozen prediction", self.reference)
-            self._adapted()
+            frozen = self._predicted(self.folder / FROZEN_FOLDER, "frozen prediction")
+            self.in_place = self._trained(self.recipe)
         elif self.adapter is not None:
-            self.in_place = load_adapter(self.model, self.adapter)
-        adapted = self.recipe is not None or self.adapter is not None
-        name = "adapted prediction" if adapted else "prediction"
-        final = self._predicted(self.folder.path, name, "first" if adapted else self.reference)
+            self.in_place = adapter_files.load_adapter(self.model, self.adapter)
+        final = self._predicted(self.folder.path, "adapted prediction" if self.in_place else "prediction")
         report = self._export(final)
         summary = self._summary(final, frozen, report)
         write_json(self.folder / SUMMARY_NAME, summary)
@@ -163,29 +295,28 @@ class Job:
         self.folder.finish()
         return summary
 
-    def _predicted(self, folder: Path, stage: str, reference: str | None) -> Reconstruction:
+    def _predicted(self, folder: Path, stage: str) -> Reconstruction:
         if (folder / PREDICTION_NAME).is_file():
             return Reconstruction.load(folder)
+        reference = None if self.in_place else self.reference
         with self._timed(stage):
             result = predict(self.model, self.batch, reference=reference, compute=self.compute)
             result.save(folder)
         return result
 
-    def _adapted(self) -> None:
+    def _trained(self, recipe: Recipe) -> Adapter:
         """Train the adapter, or continue training it, or load the finished one."""
         folder = self.folder / ADAPTER_FOLDER
         if (folder / METADATA).is_file():
-            self.in_place = load_adapter(self.model, folder)
-            return
-        assert self.recipe is not None
-        scene = self.scene or SceneImages.from_batch("photos", self.batch)
+            return adapter_files.load_adapter(self.model, folder)
+        assert self.scene is not None
         with self._timed("adaptation"):
             result = train_adapter(
-                self.model, [scene], self.recipe, seed=self.seed, compute=self.compute,
-                resume_in=folder, on_step=self.hooks.step,
+                self.model, [self.scene], recipe, seed=self.seed, compute=self.compute, resume_in=folder,
+                on_step=self.hooks.step,
             )  # fmt: skip
-        self.in_place = result.adapter
         result.save(folder)
+        return result.adapter
 
     def _export(self, final: Reconstruction) -> FilterReport | None:
         """Filter once and write all formats; None without cameras, which have no points."""
@@ -226,22 +357,13 @@ class Job:
             return None
         return loss_change(read_json(metadata)["loss_curve"])
 
-    def _timed(self, stage: str):
-        return _Timed(self, stage)
-
-
-class _Timed:
-    """Announces a stage and notes how long it took."""
-
-    def __init__(self, job: Job, stage: str):
-        self.job, self.stage = job, stage
-
-    def __enter__(self) -> None:
-        self.job.hooks.stage(self.stage)
-        self.started = time.monotonic()
-
-    def __exit__(self, *_) -> None:
-        self.job.timings[self.stage] = time.monotonic() - self.started
+    @contextmanager
+    def _timed(self, stage: str) -> Generator[None]:
+        """Announce a stage and note how long it took."""
+        self.hooks.stage(stage)
+        started = time.monotonic()
+        yield
+        self.timings[stage] = time.monotonic() - started
 
 
 def versions() -> dict[str, str]:
@@ -251,6 +373,4 @@ def versions() -> dict[str, str]:
 
 def settings_of(recipe: Recipe | None, **others: Any) -> Mapping[str, Any]:
     """Return the settings that an output folder is compared by."""
-    from dataclasses import asdict
-
     return {**others, "recipe": None if recipe is None else asdict(recipe)}

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from freegeo.adaptation import adapt as adapting
-from freegeo.adaptation.adapt import adapt, learning_rate
+from freegeo.adaptation.adapt import adapt, learning_rate, loss_change
 from freegeo.adaptation.adapter import Adapter, PackedDropout
 from freegeo.adaptation.losses import adaptation_loss, draw_tokens, feature_distance
 from freegeo.adaptation.memory import Plan
@@ -469,3 +469,10 @@ def test_a_damaged_state_is_refused(tmp_path):
     model = tiny_da3()
     with pytest.raises(UserError, match="damaged state"):
         run(model, [noise_scene(9)], quick(model), resume_in=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("totals", "first", "last"), [([3.0], 3.0, 3.0), ([4.0, 2.0], 4.0, 2.0), ([4.0, 2.0] * 10, 3.0, 3.0)]
+)
+def test_loss_change_is_of_the_first_and_last_tenth(totals, first, last):
+    assert loss_change([{"total": total} for total in totals]) == {"first": first, "last": last}

@@ -4,9 +4,11 @@ import pytest
 import torch
 from torch import nn
 
-from freegeo.adaptation.adapter import count_trainable
+from freegeo.adaptation.adapter import count_trainable, is_adapted
 from freegeo.errors import UserError
+from freegeo.models import da3_config, vggt_config
 from freegeo.models.catalog import build_empty
+from freegeo.models.checkpoints import load_weights, save_weights
 from tiny_models import attach, noise, outputs, same, tiny_da3, tiny_vggt, trained
 
 IMAGES = noise(4)
@@ -153,6 +155,61 @@ def test_merging_at_a_strength_keeps_that_strength():
     wanted = outputs(model, IMAGES)
     for found, target in zip(outputs(adapter.merge(), IMAGES), wanted, strict=True):
         torch.testing.assert_close(found, target, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(("build", "keys"), [(tiny_da3, da3_config.KEYS), (tiny_vggt, vggt_config.KEYS)])
+def test_merged_weights_go_through_a_checkpoint_file(tmp_path, build, keys):
+    model = build()
+    adapter = trained(model)
+    wanted = outputs(model, IMAGES)
+    save_weights(adapter.merge(), tmp_path / "merged.safetensors", keys, {})
+    again = build(seed=1)
+    load_weights(again, tmp_path / "merged.safetensors", keys, "tiny")
+    for found, target in zip(outputs(again, IMAGES), wanted, strict=True):
+        torch.testing.assert_close(found, target, rtol=1e-4, atol=1e-4)
+
+
+def test_a_detached_adapter_goes_back_as_it_was(model):
+    frozen, adapter = outputs(model, IMAGES), trained(model)
+    adapter.set_strength(0.5)
+    adapted, flags = outputs(model, IMAGES), [parameter.requires_grad for parameter in adapter.parameters()]
+    adapter.detach()
+    adapter.detach()
+    assert not adapter.attached and not is_adapted(model)
+    with adapter.applied():
+        assert adapter.is_on and is_adapted(model)
+        assert same(outputs(model, IMAGES), adapted)
+    assert same(outputs(model, IMAGES), frozen)
+    adapter.reattach()
+    assert same(outputs(model, IMAGES), adapted)
+    assert [parameter.requires_grad for parameter in adapter.parameters()] == flags
+    with adapter.off():
+        adapter.set_strength(1.0)
+        assert not is_adapted(model)
+        assert same(outputs(model, IMAGES), frozen)
+        with adapter.applied():
+            assert not same(outputs(model, IMAGES), frozen)
+        assert same(outputs(model, IMAGES), frozen)
+    assert not same(outputs(model, IMAGES), adapted)
+
+
+def test_an_adapter_that_is_taken_out_while_it_is_off_stays_out(model):
+    frozen, adapter = outputs(model, IMAGES), trained(model)
+    with adapter.off():
+        adapter.detach()
+    assert same(outputs(model, IMAGES), frozen)
+    assert not adapter.attached
+
+
+def test_an_adapter_does_not_go_back_where_another_one_is(model):
+    first = trained(model)
+    first.detach()
+    second = trained(model, seed=2)
+    with pytest.raises(UserError, match="already carries an adapter"):
+        first.reattach()
+    second.merge()
+    with pytest.raises(UserError, match="was merged"):
+        second.reattach()
 
 
 def test_detaching_restores_the_model_bit_for_bit(model):

@@ -68,8 +68,8 @@ def test_the_page_says_what_the_adapter_is(build, tmp_path):
     model = build()
     model.loaded_from = LoadedFrom(model=model.spec.name, file="model.safetensors", fingerprint="0123", licence="none")
     files = save_adapter(attach(model), tmp_path, METADATA)
-    page = adapter_metadata(tmp_path)
-    assert page == {
+    metadata = adapter_metadata(tmp_path)
+    assert metadata == {
         "format": 1, "base": {"model": model.spec.name, "fingerprint": "0123", "licence": "none"}, **METADATA
     }  # fmt: skip
     assert sorted(tmp_path.iterdir()) == sorted(files)

@@ -172,6 +172,7 @@ def test_output_that_cannot_be_written_to(freegeo, photo_folder, tiny, tmp_path,
         (["--precision", "fp99"], '"fp32", "bf16", "fp16"'),
         (["--device", "toaster"], "toaster"),
         (["--recipe", "paper"], "--dataset"),
+        (["--formats", "ply", "obj"], "Unknown export format 'obj'. Choose from npz, ply, glb"),
         (["--max-views", "0"], "--max-views must be at least 1"),
         (["--max-views", "2"], "needs at least 3 photos"),
         (["--reference", "best"], "best"),
@@ -198,8 +199,8 @@ def test_adapters_that_cannot_be_used(freegeo, photo_folder, tiny, tmp_path, kin
         adapter.mkdir()
     if kind == "another model":
         assert freegeo("adapt", photo_folder, "-o", adapter, *tiny, *QUICK).code == 0
-        page = adapter / "freegeo.json"
-        page.write_text(page.read_text().replace("freegeo-tiny", "da3-base"))
+        metadata = adapter / "freegeo.json"
+        metadata.write_text(metadata.read_text().replace("freegeo-tiny", "da3-base"))
     outcome = freegeo("reconstruct", photo_folder, "-o", tmp_path / "out", *tiny, "--adapter", adapter)
     assert outcome.code == 2
     expected = "made for da3-base, not for freegeo-tiny" if kind == "another model" else "not an adapter folder"

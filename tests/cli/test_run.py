@@ -99,10 +99,10 @@ def test_summary_says_how_the_result_came_about(finished, weights):
     assert summary["command"].startswith("freegeo run ")
     assert set(summary["versions"]) >= {"freegeo", "torch", "python"}
     assert all(seconds >= 0 for seconds in summary["seconds"].values())
-    page = json.loads((finished / "adapter" / "freegeo.json").read_text())
-    assert page["base"]["model"] == "freegeo-tiny"
-    assert page["base"]["fingerprint"] == summary["checkpoint"]["fingerprint"]
-    assert [set(step) >= {"total"} for step in page["loss_curve"]] == [True, True]
+    metadata = json.loads((finished / "adapter" / "freegeo.json").read_text())
+    assert metadata["base"]["model"] == "freegeo-tiny"
+    assert metadata["base"]["fingerprint"] == summary["checkpoint"]["fingerprint"]
+    assert [set(step) >= {"total"} for step in metadata["loss_curve"]] == [True, True]
     assert load_file(finished / "adapter" / "camera_token.safetensors")
 
 
@@ -197,9 +197,9 @@ def test_several_sources_make_one_adapter(freegeo, photo_folder, tiny, tmp_path)
         (other / f"{k}.png").write_bytes((photo_folder / f"{k + 1}.png").read_bytes())
     adapter = tmp_path / "adapter"
     assert freegeo("adapt", photo_folder, other, "-o", adapter, *tiny, "--epochs", 1, "--sets", 1).code == 0
-    page = json.loads((adapter / "freegeo.json").read_text())
-    assert page["scenes"] == [str(photo_folder), str(other)]
-    assert len(page["loss_curve"]) * page["recipe"]["batch"] >= 2
+    metadata = json.loads((adapter / "freegeo.json").read_text())
+    assert metadata["scenes"] == [str(photo_folder), str(other)]
+    assert len(metadata["loss_curve"]) * metadata["recipe"]["batch"] >= 2
     assert files(adapter) == ADAPTER_FILES | {f"epochs/epoch_0/{name}" for name in ADAPTER_FILES}
 
 

@@ -132,6 +132,82 @@ def test_same_names_in_several_folders_are_told_apart(tmp_path):
         unique_names([Path("/x/a.png"), Path("/x/a.png")])
 
 
+# -- images in memory, videos
+
+
+def test_images_and_arrays_are_photos(tmp_path):
+    file, image = save(tmp_path / "a.png"), Image.fromarray(quarters())
+    turned = Image.fromarray(np.ascontiguousarray(STORED[6](quarters())))
+    turned.getexif()[ORIENTATION] = 6
+    found = load_photos([quarters(), file, image, turned, image.convert("P")])
+    assert [p.name for p in found] == ["image-000", "a.png", "image-002", "image-003", "image-004"]
+    for photo in found:
+        assert photo.size_hw == (24, 40)
+        assert (photo.read() == quarters()).all()
+
+
+def test_one_image_and_a_stack_of_images():
+    assert names(quarters()) == names(Image.fromarray(quarters())) == ["image-000"]
+    assert names(np.stack([quarters()] * 3)) == ["image-000", "image-001", "image-002"]
+    assert names(pixels for pixels in [quarters()] * 2) == ["image-000", "image-001"]
+
+
+def test_an_array_that_is_changed_later_does_not_change_the_photo():
+    pixels = quarters()
+    (photo,) = load_photos([pixels])
+    pixels[:] = 0
+    assert (photo.read() == quarters()).all()
+
+
+def test_loaded_photos_stay_as_they_are(tmp_path):
+    for k in range(5):
+        save(tmp_path / f"{k}.png")
+    loaded = load_photos(tmp_path)
+    assert load_photos(loaded, max_views=2) == loaded
+    assert load_photos(tuple(loaded[:3])) == loaded[:3]
+    assert len(load_photos([*loaded, quarters()], max_views=2)) == 2
+    assert "two photos have the name 1.png" in refusal([loaded[1], loaded[1]])
+    assert "two photos have the name 1.png" in refusal([loaded[1], tmp_path / "1.png"])
+
+
+def test_the_home_folder_may_be_short(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    save(tmp_path / "p" / "a.png")
+    for source in ("~/p", Path("~/p"), "~/p/*.png", "~/p/a.png", ["~/p/a.png"]):
+        assert names(source) == ["a.png"]
+
+
+@pytest.mark.parametrize(
+    ("pixels", "words"),
+    [
+        (quarters() / 255, "image-001 is an array of float64 and shape (24, 40, 3)"),
+        (quarters().astype(np.int32), "array of int32"),
+        (quarters()[..., 0], "shape (24, 40)"),
+        (quarters().transpose(2, 0, 1), "shape (3, 24, 40)"),
+        (np.zeros((0, 4, 3), np.uint8), "shape (0, 4, 3)"),
+        (None, "element 1 of the photos is None"),
+        (7, "element 1 of the photos is of the type int"),
+    ],
+)
+def test_images_that_cannot_be_used(pixels, words):
+    assert words in refusal([quarters(), pixels])
+
+
+@pytest.mark.parametrize("source", [None, 3, lambda: None])
+def test_what_is_no_source(source):
+    assert "not of the type" in refusal(source) or "not None" in refusal(source)
+
+
+def test_frames_per_second_are_for_videos(tmp_path):
+    with pytest.raises(UserError, match="--fps is for videos"):
+        load_photos(save(tmp_path / "a.png"), fps=2.0)
+    with pytest.raises(UserError, match="no such video"):
+        load_photos(tmp_path / "a.mp4", fps=2.0)
+    with pytest.raises(UserError, match="empty"):
+        load_photos("")
+
+
 # -- pixels
 
 

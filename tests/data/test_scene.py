@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from freegeo.data.procedural import RenderedPhoto
+from freegeo.data.photos import MemoryPhoto
 from freegeo.data.scene import Scene
 from freegeo.errors import UserError
 
 
 def scene(views: int = 5, **changes) -> Scene:
-    photos = tuple(RenderedPhoto(f"{i}.png", np.full((2, 3, 3), i, np.uint8)) for i in range(views))
+    photos = tuple(MemoryPhoto(f"{i}.png", np.full((2, 3, 3), i, np.uint8)) for i in range(views))
     numbers = torch.arange(views, dtype=torch.float32)[:, None, None]
     given = {
         "name": "numbered",

@@ -12,12 +12,12 @@ from exact_rooms import PHOTO_SCALE, room
 from freegeo.data.procedural import render, sample_rooms
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.depth_png import depth_names, write_depth
-from freegeo.export.formats import WRITERS, export, filter_reconstruction
+from freegeo.export.formats import FORMATS, export, filter_reconstruction
 from freegeo.export.mesh import fuse, voxel_size, write_mesh
 from freegeo.export.nerfstudio import opengl_camera_to_world
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.fusion.filtering import FilterSettings
+from freegeo.fusion.settings import FilterSettings
 from freegeo.geometry.depth import depth_to_world
 
 EVERYTHING = FilterSettings(drop_share=0, flying=False, multi_view=False)
@@ -26,7 +26,7 @@ EVERYTHING = FilterSettings(drop_share=0, flying=False, multi_view=False)
 def test_every_format_is_written_once_and_points_are_shared(tmp_path):
     pytest.importorskip("pycolmap", reason="needs the extra colmap")
     scene = room()
-    written = export(scene, tmp_path, [*WRITERS, "ply"], max_points=500, max_tracks=100)
+    written = export(scene, tmp_path, [*FORMATS, "ply"], max_points=500, max_tracks=100)
     assert len(set(written)) == len(written)
     assert all(path.is_file() for path in written)
     on_disk = {p.relative_to(tmp_path) for p in tmp_path.rglob("*") if p.is_file()}
@@ -34,6 +34,34 @@ def test_every_format_is_written_once_and_points_are_shared(tmp_path):
     assert len(trimesh.load(tmp_path / "points.ply").vertices) == 500
     assert len(trimesh.load(tmp_path / "scene.glb").geometry["points"].vertices) == 500
     np.testing.assert_array_equal(Reconstruction.load(tmp_path).depth_z, scene.depth_z)
+
+
+def test_all_stands_for_every_format_and_each_is_where_it_says(tmp_path):
+    pytest.importorskip("pycolmap", reason="needs the extra colmap")
+    written = room().export(str(tmp_path), ["ply", "all"], max_points=100, max_tracks=50)
+    for format in FORMATS.values():
+        place = tmp_path / format.path
+        assert any(path == place or place in path.parents for path in written), format.name
+
+
+def test_only_formats_without_points_can_do_without_cameras(tmp_path):
+    flat = replace(room(), T_cam_world=None, K=None)
+    for format in FORMATS.values():
+        if format.needs_cameras:
+            with pytest.raises(UserError, match="no cameras"):
+                flat.export(tmp_path, [format.name])
+        else:
+            assert flat.export(tmp_path / format.name, [format.name])
+
+
+def test_a_reconstruction_exports_what_its_filters_and_masks_leave(tmp_path):
+    scene = room()
+    masks = [np.zeros(tuple(hw), np.uint8) for hw in scene.photo_hw]
+    masks[1][20:40, 20:40] = 1
+    assert room().export(tmp_path / "default") == [tmp_path / "default" / n for n in ("points.ply", "scene.glb")]
+    scene.export(tmp_path, ["ply"], filters=EVERYTHING, masks=masks)
+    kept, _ = filter_reconstruction(scene, masks=masks_for_model(scene, masks), settings=EVERYTHING)
+    assert 0 < len(trimesh.load(tmp_path / "points.ply").vertices) == kept.sum() < kept.size / 10
 
 
 def test_filters_decide_what_is_exported(tmp_path):

@@ -32,6 +32,12 @@ def prediction_of(views=3, hw=(8, 12)):
     )
 
 
+def test_describes_itself_without_its_arrays():
+    assert repr(room()).startswith("Reconstruction(4 views, ")
+    assert repr(room()).endswith(" pixels, cameras)")
+    assert repr(replace(room(), T_cam_world=None, K=None)).endswith(" pixels, no cameras)")
+
+
 def test_a_saved_reconstruction_comes_back_bit_for_bit(tmp_path):
     stored = Reconstruction.from_prediction(prediction_of(), batch_of())
     assert stored.save(tmp_path / "out") == tmp_path / "out" / "prediction.npz"

@@ -7,7 +7,8 @@ import torch
 from freegeo.data.procedural import render, sample_rooms
 from freegeo.errors import UserError
 from freegeo.fusion.agreement import look_up, nearest_views, prepare, vote
-from freegeo.fusion.filtering import FilterSettings, confident_pixels, filter_pixels, flying_pixels
+from freegeo.fusion.filtering import confident_pixels, filter_pixels, flying_pixels
+from freegeo.fusion.settings import FilterSettings
 
 GOOD, FLYING, OUTLIER, PATCH, TOUCHED = range(5)
 

@@ -17,7 +17,7 @@ import parity_da3  # noqa: E402
 import parity_vggt  # noqa: E402
 from freegeo.errors import UserError  # noqa: E402
 from freegeo.models import catalog, da3_config, vggt_config  # noqa: E402
-from freegeo.models.checkpoints import find_file  # noqa: E402
+from freegeo.models.checkpoints import find_file, save_weights  # noqa: E402
 from freegeo.models.spec import ModelEntry  # noqa: E402
 
 DA3 = TESTS / "fixtures" / "da3" / "tiny-mlp"
@@ -279,3 +279,12 @@ def test_unreachable_hub_is_noticed_before_the_download_and_without_noise(hub, c
 def test_downloaded_checkpoint_needs_no_network(hub):
     hub.answers, hub.cached = False, "/cache/model.safetensors"
     assert catalog.download("da3-small").as_posix() == "/cache/model.safetensors"
+
+
+@pytest.mark.parametrize(("name", "folder"), [("small-da3", DA3), ("small-vggt", VGGT)])
+def test_saved_weights_have_the_official_names_and_load_again(tmp_path, name, folder):
+    model, path = load(name, folder / "weights.safetensors"), tmp_path / "again.safetensors"
+    save_weights(model, path, catalog.entry(name).keys, {"licence": "none"})
+    assert load_file(path).keys() == load_file(folder / "weights.safetensors").keys()
+    again = load(name, path).state_dict()
+    assert all(torch.equal(value, again[key]) for key, value in model.state_dict().items())

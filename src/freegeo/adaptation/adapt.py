@@ -62,6 +62,14 @@ class Adapted:
     """Loss terms of every step."""
     seconds: float = 0.0
 
+    def __repr__(self) -> str:
+        """Return how long the run was and what came of it."""
+        change = self.loss_change()
+        return (
+            f"Adapted({self.recipe.name} recipe, {len(self.curve)} steps, loss {change['first']:.4g} -> "
+            f"{change['last']:.4g}, {self.seconds:.0f} s)"
+        )
+
     def metadata(self) -> dict[str, Any]:
         """Return what freegeo.json says of the run."""
         return {
@@ -72,8 +80,9 @@ class Adapted:
             "seconds": round(self.seconds, 2),
         }
 
-    def save(self, folder: Path) -> None:
+    def save(self, folder: Path | str) -> None:
         """Write the adapter, and remove the state of the run from the folder."""
+        folder = Path(folder).expanduser()
         save_adapter(self.adapter, folder, self.metadata())
         remove_state(folder)
 

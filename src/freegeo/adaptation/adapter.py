@@ -1,4 +1,4 @@
-"""LoRA on the cross-view layers together with the camera token: attach, switch off, scale, fold in, take out.
+"""LoRA on the cross-view layers together with the camera token: attach, switch off, scale, fold in, take out, put back.
 
 peft owns the LoRA layers; the camera token is a parameter, not a module, so it is owned here and swapped into the model
 while the adapter is on. The base weights are never touched before `merge`.
@@ -35,6 +35,12 @@ def count_trainable(model: ReconstructionModel, rank: int) -> int:
     lora = sum(rank * (linear.in_features + linear.out_features) for linear in linears)
     token = part.get_parameter(part.camera_token_name).numel() if part.camera_token_name else 0
     return lora + token
+
+
+def is_adapted(model: nn.Module) -> bool:
+    """Whether an adapter is in place on a model, and on."""
+    # Only peft's layers have this attribute; asking for their class would load peft, which takes seconds.
+    return any(not getattr(module, "disable_adapters", True) for module in model.modules())
 
 
 class PackedDropout(nn.Module):
@@ -74,7 +80,30 @@ class Adapter:
         self.camera_token = None if self._base_token is None else nn.Parameter(self._base_token.detach().clone())
         self._scaling = {name: layer.scaling[ADAPTER_NAME] for name, layer in layers.items()}
         self.strength = 1.0
-        self._install_token(self.camera_token)
+        self._peft_config = model.peft_config
+        self._token = self.camera_token
+        self._install_token(self._token)
+
+    def __repr__(self) -> str:
+        """Return the model, the rank and the state."""
+        off = "off" if self.attached else "merged" if self._merged else "detached"
+        strength = "" if self.strength == 1 else f", strength {self.strength:g}"
+        return f"Adapter({self.model.spec.name}, rank {self.lora_config.r}, {'on' if self.is_on else off}{strength})"
+
+    @property
+    def attached(self) -> bool:
+        """Whether the adapter is in place on its model, on or off."""
+        name, layer = next(iter(self.layers.items()))
+        return self.model.get_submodule(name) is layer
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the model computes with the adapter."""
+        return self.attached and not next(iter(self.layers.values())).disable_adapters
+
+    @property
+    def _merged(self) -> bool:
+        return next(iter(self.layers.values())).merged
 
     @classmethod
     def attach(
@@ -96,8 +125,7 @@ class Adapter:
         from peft.tuners.lora import LoraLayer
 
         part = model.adaptable()
-        if any(isinstance(module, LoraLayer) for module in part.modules()):
-            raise UserError("the model already carries an adapter; detach it first.")
+        _require_none(part)
         wanted = sorted(part.adapter_targets() if targets is None else targets)
         modules = dict(part.named_modules())
         unmatched = [name for name in wanted if not isinstance(modules.get(name), nn.Linear)]
@@ -148,56 +176,104 @@ class Adapter:
     @contextmanager
     def off(self) -> Generator[None]:
         """Run the frozen model inside the block: LoRA bypassed, original camera token, nothing forgotten after it."""
-        token = _parameter(self.model, self.model.camera_token_name)
-        flags = [parameter.requires_grad for parameter in self.parameters()]
-        self._enable(False)
-        self._install_token(self._base_token)
+        with self._switched(False):
+            yield
+
+    @contextmanager
+    def applied(self) -> Generator[None]:
+        """Run the adapted model inside the block, also if the adapter is off or detached; afterwards all is as before.
+
+        UserError as in `reattach`.
+        """
+        if self.attached:
+            with self._switched(True):
+                yield
+            return
+        self.reattach()
         try:
             yield
         finally:
-            self._enable(True)
-            self._install_token(token)
-            # peft clears and sets requires_grad when it switches adapters; ours are as they were.
-            for parameter, flag in zip(self.parameters(), flags, strict=True):
-                parameter.requires_grad_(flag)
+            self.detach()
+
+    @contextmanager
+    def _switched(self, on: bool) -> Generator[None]:
+        before, flags = self.is_on, self._flags()
+        if self.attached:
+            self._switch(on)
+        try:
+            yield
+        finally:
+            if self.attached:
+                self._switch(before, flags)
 
     def set_strength(self, strength: float) -> None:
         """Interpolate between the frozen model (0) and the adapted one (1), LoRA and camera token together."""
         self.strength = strength
         for name, layer in self.layers.items():
             layer.scaling[ADAPTER_NAME] = self._scaling[name] * strength
-        if self.camera_token is None or self._base_token is None or strength == 1:
-            self._install_token(self.camera_token)
-        else:
+        self._token = self.camera_token
+        if self.camera_token is not None and self._base_token is not None and strength != 1:
             mixed = self._base_token.detach().lerp(self.camera_token.detach().to(self._base_token), strength)
-            self._install_token(nn.Parameter(mixed, requires_grad=False))
+            self._token = nn.Parameter(mixed, requires_grad=False)
+        if self.is_on:
+            self._install_token(self._token)
 
     def merge(self) -> ReconstructionModel:
         """Fold the adapter (at its strength) into the weights and return the plain model; the adapter is used up."""
+        self.reattach()
         for layer in self.layers.values():
             layer.merge(safe_merge=True)
         self._remove_layers()
-        token = _parameter(self.model, self.model.camera_token_name)
-        if token is not None:
-            self._install_token(nn.Parameter(token.detach().clone(), requires_grad=False))
+        if self._token is not None:
+            self._install_token(nn.Parameter(self._token.detach().clone(), requires_grad=False))
         return self.model
 
     def detach(self) -> ReconstructionModel:
-        """Take the adapter out and return the model as it was."""
-        self._remove_layers()
-        self._install_token(self._base_token)
+        """Take the adapter out, if it is in place, and return the model as it was."""
+        if self.attached:
+            self._remove_layers()
+            self._install_token(self._base_token)
         return self.model
+
+    def reattach(self) -> None:
+        """Put the adapter back on its model after `detach`, on; nothing happens while it is in place.
+
+        UserError when another adapter is in place, or when this one was merged.
+        """
+        if self.attached:
+            return
+        if self._merged:
+            raise UserError("this adapter was merged into its model, so it cannot be used again; load it once more.")
+        _require_none(self.model)
+        for name, layer in self.layers.items():
+            for matrix in _matrices(layer):
+                # The model may have been moved meanwhile.
+                matrix.data = matrix.data.to(cast(nn.Linear, layer.base_layer).weight.device)
+            self._put(name, cast(nn.Module, layer))
+        self.model.peft_config = self._peft_config
+        self._switch(True, self._flags())
 
     def _remove_layers(self) -> None:
         for name, layer in self.layers.items():
-            owner, _, leaf = name.rpartition(".")
-            setattr(self.model.get_submodule(owner), leaf, layer.base_layer)
+            self._put(name, layer.base_layer)
         # peft notes its configuration on the model and would warn about a second adapter.
         del self.model.peft_config
 
-    def _enable(self, enabled: bool) -> None:
+    def _put(self, name: str, module: nn.Module) -> None:
+        owner, _, leaf = name.rpartition(".")
+        setattr(self.model.get_submodule(owner), leaf, module)
+
+    def _flags(self) -> list[bool]:
+        return [parameter.requires_grad for parameter in self.parameters()]
+
+    def _switch(self, on: bool, flags: Sequence[bool] = ()) -> None:
+        """Turn an adapter that is in place on or off; `flags` say afterwards which parameters are trained."""
         for layer in self.layers.values():
-            layer.enable_adapters(enabled)
+            layer.enable_adapters(on)
+        # peft clears and sets requires_grad when it switches adapters.
+        for parameter, flag in zip(self.parameters(), flags, strict=False):
+            parameter.requires_grad_(flag)
+        self._install_token(self._token if on else self._base_token)
 
     def _install_token(self, token: nn.Parameter | None) -> None:
         if token is None or self.model.camera_token_name is None:
@@ -207,6 +283,12 @@ class Adapter:
         # A model that was moved meanwhile took along only the token that was in place.
         token.data = token.data.to(parameters[leaf])
         parameters[leaf] = token
+
+
+def _require_none(model: nn.Module) -> None:
+    """Raise UserError when a model already carries an adapter, on or off."""
+    if any(hasattr(module, "disable_adapters") for module in model.modules()):
+        raise UserError("the model already carries an adapter; detach it first.")
 
 
 def _same_endings(modules: Iterable[str], wanted: Sequence[str]) -> list[str]:

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from freegeo.cli import console
-from freegeo.cli.jobs import progress_hooks, say_finished, squashed_scene
+from freegeo.cli.jobs import say_finished
 from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source, split_scenes
+from freegeo.progress import step_bar
 
 if TYPE_CHECKING:
     from freegeo.adaptation.recipe import Recipe
@@ -43,8 +44,7 @@ def adapt(
     published
         Also write the adapter in the layout of the authors' release, below `published`.
     """
-    from freegeo.adaptation.samples import SceneImages
-    from freegeo.pipeline import require_enough_photos, settings_of
+    from freegeo.pipeline import require_enough_photos, scene_images, settings_of
     from freegeo.run_folder import check_folder, run_folder
 
     scenes = {str(part[0]): load_source(part, photos) for part in split_scenes(sources)}
@@ -56,10 +56,7 @@ def adapt(
     about = {name: {"photos": list(batch.names), "contents": batch.digest()} for name, batch in batches.items()}
     settings = settings_of(plan, command="adapt", scenes=about, published=published, **model.settings(loaded))
     check_folder(output.output, settings, overwrite=output.overwrite)
-    images = [
-        squashed_scene(scenes[name], loaded, plan) or SceneImages.from_batch(name, batch)
-        for name, batch in batches.items()
-    ]
+    images = [scene_images(name, scenes[name], loaded, plan, batch) for name, batch in batches.items()]
     with run_folder(output.output, settings, overwrite=output.overwrite) as folder:
         if folder.finished:
             say_finished(output.output, folder.finished_at)
@@ -86,9 +83,9 @@ def _train(
             about = {"epoch": epoch, "scenes": [scene.name for scene in images], "seed": model.seed}
             save_adapter(adapter, folder / "epochs" / f"epoch_{epoch}", about)
 
-    with progress_hooks() as hooks:
+    with step_bar() as on_step:
         result = train_adapter(
-            loaded, images, plan, seed=model.seed, compute=model.compute(), resume_in=folder, on_step=hooks.step,
+            loaded, images, plan, seed=model.seed, compute=model.compute(), resume_in=folder, on_step=on_step,
             on_epoch=keep_epoch,
         )  # fmt: skip
     result.save(folder)

@@ -14,6 +14,7 @@ from freegeo.cli import console
 from freegeo.cli.options import ModelOptions, RecipeOptions, use_few_threads
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.models.catalog import EMBEDDED_MODEL
+from freegeo.progress import progress_bar
 
 if TYPE_CHECKING:
     from freegeo.benchmark.paper.experiments import Experiment
@@ -292,7 +293,7 @@ def _predict(
         console.say(f"  {cost.line()}")
     if estimate_only:
         return []
-    with locked(bench.output), console.progress_bar("predicting", len(waiting)) as update:
+    with locked(bench.output), progress_bar("predicting", len(waiting)) as update:
         done = 0
 
         def on_task(task: Task) -> None:
@@ -317,7 +318,7 @@ def _evaluate(bench: BenchOptions, device: str | None, *, wanted: list[Task] | N
     from freegeo.models.precision import choose_device
 
     total = len(wanted) if wanted is not None else len(stored_tasks(bench.output))
-    with console.progress_bar("scoring", max(total, 1)) as update:
+    with progress_bar("scoring", max(total, 1)) as update:
         done = 0
 
         def on_task(task: Task) -> None:

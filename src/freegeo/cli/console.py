@@ -1,4 +1,4 @@
-"""What the commands say: messages, progress with time left, and a summary of what was written."""
+"""What the commands say: messages, tables, and a summary of what was written."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ import shlex
 import sys
 import textwrap
 import warnings
-from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 _typed: list[str] = []
 
@@ -61,58 +59,6 @@ def fail(sentence: str, code: int) -> int:
     """Print why a command stopped and return its exit code."""
     note(f"freegeo: {sentence}")
     return code
-
-
-@contextmanager
-def progress_bar(title: str, total: int) -> Generator[Any]:
-    """Show a bar with time left on a terminal, a line every tenth elsewhere; gives `update(done, text)`."""
-    if not sys.stderr.isatty():
-        yield _lines(title, total)
-        return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
-        TimeRemainingColumn(), TextColumn("{task.fields[text]}"),
-    )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task, known = bar.add_task(title, total=total, text=""), False
-
-        def update(done: int, text: str = "") -> None:
-            nonlocal known
-            if not known:  # a resumed run begins far from zero, which must not look like speed
-                known = True
-                bar.reset(task, completed=done, text=text)
-            bar.update(task, completed=done, text=text)
-
-        yield update
-
-
-def _lines(title: str, total: int):
-    import time
-
-    first, shown = None, -1
-
-    def update(done: int, text: str = "") -> None:
-        nonlocal first, shown
-        # What comes before the first report, such as an adaptation or an earlier leg, says nothing about the speed.
-        first = first or (done, time.monotonic())
-        tenth = done * 10 // total
-        if tenth > shown:
-            shown = tenth
-            gained, seconds = done - first[0], time.monotonic() - first[1]
-            left = f", {seconds * (total - done) / gained:.0f} s left" if gained else ""
-            note(f"{title}: {done}/{total}{left}{', ' + text if text else ''}")
-
-    return update
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, prose: int = 0) -> str:

@@ -8,7 +8,9 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from freegeo.cli import console
-from freegeo.cli.files import FilterOptions, Format
+from freegeo.cli.files import FORMAT_NAMES, FilterOptions
+from freegeo.export.base import MAX_TRACKS
+from freegeo.fusion.settings import MAX_POINTS
 
 DEFAULT_FILTERS = FilterOptions()
 
@@ -16,11 +18,11 @@ DEFAULT_FILTERS = FilterOptions()
 def export(
     source: Path,
     *,
-    format: Annotated[list[Format], Parameter(name=("--format", "-f"), consume_multiple=True)],
+    format: Annotated[list[str], FORMAT_NAMES, Parameter(name=("--format", "-f"))],
     output: Annotated[Path | None, Parameter(name=("--output", "-o"))] = None,
     frozen: bool = False,
-    max_points: int = 1_000_000,
-    max_tracks: int = 100_000,
+    max_points: int = MAX_POINTS,
+    max_tracks: int = MAX_TRACKS,
     voxel: float | None = None,
     filters: FilterOptions = DEFAULT_FILTERS,
 ) -> None:
@@ -30,8 +32,6 @@ def export(
     ----------
     source
         Folder that `run` or `reconstruct` wrote.
-    format
-        One or several of ply, glb, mesh, colmap, nerfstudio, depth, npz.
     output
         Folder for the files; default: the reconstruction's own.
     frozen

@@ -5,19 +5,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from freegeo.errors import UserError
+from freegeo.export.base import DEFAULT_FORMATS
+from freegeo.export.formats import ALL, FORMATS, chosen_formats
+from freegeo.fusion.settings import FilterSettings
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from freegeo.fusion.filtering import FilterSettings
     from freegeo.types import PhotoLike
 
-Format = Literal["ply", "glb", "mesh", "colmap", "nerfstudio", "depth", "npz"]
+DEFAULTS = FilterSettings()
+
+
+def _check_formats(hint: object, names: Sequence[str]) -> None:
+    chosen_formats(names)
+
+
+FORMAT_NAMES = Parameter(
+    consume_multiple=True, validator=_check_formats, help=f"Any of {', '.join(FORMATS)}; or {ALL}."
+)
 
 
 @Parameter(name="*")
@@ -25,21 +36,19 @@ Format = Literal["ply", "glb", "mesh", "colmap", "nerfstudio", "depth", "npz"]
 class FilterOptions:
     """Which points are kept."""
 
-    drop_share: float = 0.4
+    drop_share: float = DEFAULTS.drop_share
     """Least confident share of the pixels to drop, from 0 to below 1."""
-    flying: bool = True
+    flying: bool = DEFAULTS.flying
     """Drop pixels that hang between surfaces."""
-    multi_view: bool = True
+    multi_view: bool = DEFAULTS.multi_view
     """Drop pixels that more views contradict than confirm."""
-    min_agreeing: int = 0
+    min_agreeing: int = DEFAULTS.min_agreeing
     """Other views that must agree with a pixel; more than 0 makes sparse, sure clouds."""
     masks: Path | None = None
     """Folder with one mask image per photo (same name, any image type; white is wanted)."""
 
     def settings(self) -> FilterSettings:
         """Return the filter settings."""
-        from freegeo.fusion.filtering import FilterSettings
-
         return FilterSettings(
             drop_share=self.drop_share, flying=self.flying, multi_view=self.multi_view, min_agreeing=self.min_agreeing
         )
@@ -58,15 +67,18 @@ class FilterOptions:
 class FileOptions:
     """Which files are written besides the predictions."""
 
-    formats: Annotated[tuple[Format, ...], Parameter(consume_multiple=True)] = ("ply", "glb")
-    """Any of ply, glb, mesh, colmap, nerfstudio, depth, npz."""
+    formats: Annotated[tuple[str, ...], FORMAT_NAMES] = DEFAULT_FORMATS
     filters: FilterOptions = FilterOptions()
 
     def settings(self) -> dict[str, object]:
         """Return what the files depend on, for comparison with an existing folder."""
         values = asdict(self.filters)
         masks = values.pop("masks")
-        return {"formats": list(self.formats), "filters": values, "masks": None if masks is None else str(masks)}
+        return {
+            "formats": chosen_formats(self.formats),
+            "filters": values,
+            "masks": None if masks is None else str(masks),
+        }
 
     def checked_masks(self, photos: Sequence[PhotoLike]) -> list[np.ndarray] | None:
         """Read the masks and refuse other sizes than the photos', before anything is computed."""

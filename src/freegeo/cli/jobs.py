@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any
 from freegeo.cli import console
 from freegeo.cli.files import FileOptions
 from freegeo.cli.options import ModelOptions, OutputOptions
+from freegeo.export import reconstruction as npz
+from freegeo.export.formats import FORMATS
+from freegeo.progress import step_bar
 from freegeo.run_folder import check_folder, run_folder
 
 if TYPE_CHECKING:
     from freegeo.adaptation.recipe import Recipe
-    from freegeo.adaptation.samples import SceneImages
     from freegeo.models.api import ReconstructionModel
     from freegeo.pipeline import Hooks, Job
     from freegeo.types import PhotoLike
@@ -23,15 +25,10 @@ DEFAULT_FILES = FileOptions()
 FRAMES_FOLDER = "images"
 FILES = {
     "report.html": "the page to look at first",
-    "prediction.npz": "depth, confidence, cameras",
+    npz.FORMAT.path: npz.FORMAT.about,
     "frozen/prediction.npz": "the same before adaptation",
     "adapter": "the adapter (peft format)",
-    "points.ply": "coloured points",
-    "scene.glb": "points and camera frusta",
-    "mesh.ply": "surface",
-    "colmap": "COLMAP model with tracks",
-    "transforms.json": "nerfstudio cameras",
-    "depth": "16-bit depth images",
+    **{format.path: format.about for format in FORMATS.values()},
     "images": "the frames of the video that were used",
     "reconstruction.json": "settings, timings, versions, licence of the weights",
 }
@@ -42,24 +39,8 @@ def progress_hooks() -> Generator[Hooks]:
     """Show stages and adaptation steps."""
     from freegeo.pipeline import Hooks
 
-    bars: list[Any] = []
-
-    def show_step(progress) -> None:
-        if not bars:
-            bars.append(console.progress_bar("adapting", progress.steps))
-            bars.append(bars[0].__enter__())
-        last = progress.step + 1 == progress.steps
-        # Reading a loss waits for the device, so it is done now and then only.
-        text = f"loss {float(progress.terms['total']):.4f}" if last or progress.step % 10 == 0 else None
-        bars[1](progress.step + 1, **({} if text is None else {"text": text}))
-        if last:
-            bars[0].__exit__(None, None, None)
-
-    try:
-        yield Hooks(stage=lambda name: console.note(f"{name} ..."), step=show_step)
-    finally:
-        if bars:
-            bars[0].__exit__(None, None, None)
+    with step_bar() as on_step:
+        yield Hooks(stage=lambda name: console.note(f"{name} ..."), step=on_step)
 
 
 def run_job(
@@ -80,7 +61,7 @@ def run_job(
     `after` writes more before the folder counts as finished.
     """
     from freegeo.data.video import VideoFrame
-    from freegeo.pipeline import Job, require_enough_photos, settings_of
+    from freegeo.pipeline import Job, require_enough_photos, scene_images, settings_of
 
     if recipe is not None:
         require_enough_photos(photos)
@@ -106,20 +87,9 @@ def run_job(
             model=model, batch=batch, folder=folder, recipe=recipe, adapter=adapter, seed=model_options.seed,
             compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), after=after, formats=files.formats, filters=files.filters.settings(),
-            masks=masks, scene=squashed_scene(photos, model, recipe),
+            masks=masks, scene=None if recipe is None else scene_images("photos", photos, model, recipe, batch),
         )  # fmt: skip
         describe(job.run(), output.output)
-
-
-def squashed_scene(
-    photos: Sequence[PhotoLike], model: ReconstructionModel, recipe: Recipe | None
-) -> SceneImages | None:
-    """Return the images of a recipe that has its own way to resize them."""
-    from freegeo.adaptation.samples import SceneImages
-
-    if recipe is None or recipe.squash is None:
-        return None
-    return SceneImages.from_photos("photos", photos, model, recipe)
 
 
 def save_frames(photos: Sequence[PhotoLike], folder: Path) -> None:

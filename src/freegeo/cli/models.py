@@ -9,6 +9,7 @@ from cyclopts import App, Parameter
 
 from freegeo.cli import console
 from freegeo.models import catalog
+from freegeo.progress import progress_bar
 
 app = App(name="models", help="List, describe, download and check models.", help_format="plaintext")
 TABLE_WIDTH = 100
@@ -141,7 +142,7 @@ def score(
         get_domain(name).seeds(rooms)
     loaded = catalog.load_model(model, checkpoint=checkpoint)
     use_few_threads(loaded)
-    with console.progress_bar("domains", len(names)) as update:
+    with progress_bar("domains", len(names)) as update:
         card = report_card(
             loaded, output, side=loaded.spec.default_side, domains=dict.fromkeys(names, rooms),
             on_domain=lambda name: update(names.index(name), name),

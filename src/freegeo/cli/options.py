@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from freegeo.adaptation.recipe import PAPER, SEED, DatasetName, Recipe, RecipeName, named
+from freegeo.data.photos import MAX_VIEWS
 from freegeo.errors import UserError
 from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL
 
@@ -166,7 +167,7 @@ def _read_like(example: object, text: str) -> object:
 class PhotoOptions:
     """Which photos are used."""
 
-    max_views: int = 32
+    max_views: int = MAX_VIEWS
     """Most photos that are used; of more, as many are chosen evenly."""
     fps: float | None = None
     """Videos: take a frame this often per second; default: by sharpness and parallax."""

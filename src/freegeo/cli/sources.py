@@ -21,16 +21,11 @@ DEMO_FRAMES = 16
 def load_source(sources: Sequence[str], photos: PhotoOptions) -> list[PhotoLike]:
     """Return the photos of one scene: several files are one scene, in the order given."""
     from freegeo.data.photos import load_photos
-    from freegeo.data.video import is_video, load_video
 
     require_sources(sources)
     if list(sources) == [DEMO]:
         return list(demo_scene(0, DEMO_DOMAIN).photos)[: photos.max_views]
-    if len(sources) == 1 and is_video(sources[0]):
-        return list(load_video(sources[0], fps=photos.fps, max_views=photos.max_views))
-    if photos.fps is not None:
-        raise UserError("--fps is for videos; the source is none.")
-    return list(load_photos(sources[0] if len(sources) == 1 else list(sources), photos.max_views))
+    return load_photos(sources[0] if len(sources) == 1 else list(sources), photos.max_views, fps=photos.fps)
 
 
 def require_sources(sources: Sequence[str]) -> None:
@@ -55,6 +50,6 @@ def split_scenes(sources: Sequence[str]) -> list[list[str]]:
     from freegeo.data.video import is_video
 
     require_sources(sources)
-    if all(Path(source).is_file() and not is_video(source) for source in sources):
+    if all(Path(source).expanduser().is_file() and not is_video(source) for source in sources):
         return [list(sources)]
     return [[source] for source in sources]

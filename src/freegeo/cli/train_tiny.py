@@ -7,6 +7,7 @@ from typing import Any
 
 from freegeo.cli import console
 from freegeo.models.catalog import EMBEDDED_MODEL
+from freegeo.progress import progress_bar
 
 
 def train_tiny(
@@ -63,7 +64,7 @@ def train_tiny(
         "first_room": first_room,
     }
     config = TrainConfig(seed=seed, **{name: value for name, value in given.items() if value is not None})
-    with console.progress_bar("views", config.views) as update:
+    with progress_bar("views", config.views) as update:
         weights = train(
             config, output, minutes=minutes, workers=workers, device=str(choose_device(device)),
             continue_from=continue_from, progress=lambda state: update(min(state.seen, config.views)),

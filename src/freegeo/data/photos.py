@@ -1,4 +1,4 @@
-"""A user's photos: a folder, a glob or a list of files, in natural order, upright, as 8-bit RGB."""
+"""A user's photos: files, a video, or images in memory; in natural order, upright, as 8-bit RGB."""
 
 from __future__ import annotations
 
@@ -6,14 +6,24 @@ import glob
 import logging
 import re
 import warnings
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
+from freegeo.data.video import is_video, load_video
 from freegeo.errors import UserError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image as PillowImage
+
+    from freegeo.types import PhotoLike
+
+    PhotoSource = str | Path | np.ndarray | PillowImage | Iterable[str | Path | np.ndarray | PillowImage | PhotoLike]
+    """What `load_photos` takes."""
 
 logger = logging.getLogger(__name__)
 
@@ -22,6 +32,7 @@ HEIF_SUFFIXES = frozenset({".heic", ".heif"})
 MAX_PIXELS = 150_000_000
 """Largest photo that is read; beyond it a decoded photo takes more than half a gigabyte."""
 MAX_VIEWS = 32
+"""Photos that are used of a source of more."""
 _SYSTEM_FILES = frozenset({"thumbs.db", "desktop.ini"})
 _ORIENTATION_TAG, _SIDEWAYS = 0x0112, (5, 6, 7, 8)
 
@@ -49,20 +60,67 @@ class Photo:
         return pixels
 
 
-def load_photos(source: str | Path | Sequence[str | Path], max_views: int = MAX_VIEWS) -> list[Photo]:
-    """Find the photos of a source and keep at most `max_views` of them, evenly spaced in natural name order.
+@dataclass(frozen=True, eq=False)
+class MemoryPhoto:
+    """One photo in memory."""
 
-    `source` is a folder, a glob pattern, or a list of files. UserError says which file is missing, unreadable, no
-    photo, or larger than `MAX_PIXELS`.
+    name: str
+    pixels: np.ndarray
+    """(H, W, 3) uint8 RGB, upright."""
+
+    @property
+    def size_hw(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.pixels.shape[0], self.pixels.shape[1]
+
+    def read(self) -> np.ndarray:
+        """Return the pixels (H, W, 3) uint8."""
+        return self.pixels
+
+
+def load_photos(source: PhotoSource, max_views: int = MAX_VIEWS, *, fps: float | None = None) -> list[PhotoLike]:
+    """Find the photos of a source and keep at most `max_views` of them, evenly spaced.
+
+    Args:
+        source: a folder, a pattern such as `photos/*.jpg` (both in natural name order), a video, a photo, or a list of
+            photo files, PIL images and arrays (H, W, 3) uint8. `~` stands for the home folder. Images in memory are
+            named after their place in the list: `image-000`, `image-001`, ... A list that this function returned is
+            returned as it is.
+        max_views: most photos to keep; frames of a video are chosen by sharpness and parallax instead of evenly.
+        fps: videos only: take a frame this often per second.
+
+    Raises:
+        UserError: says which file is missing, unreadable, no photo, or larger than `MAX_PIXELS`, and which image is not
+            of the kind above.
     """
     if max_views < 1:
         raise UserError(f"--max-views must be at least 1, got {max_views}.")
-    paths = find_photos(source)
-    if len(paths) > max_views:
-        logger.info("%d photos found, %d kept, evenly spaced (--max-views)", len(paths), max_views)
-        paths = [paths[i] for i in evenly_spaced(len(paths), max_views)]
-    names = unique_names(paths)
-    return [Photo(name, path, _size_hw(path)) for name, path in zip(names, paths, strict=True)]
+    if isinstance(source, str | Path) and is_video(source):
+        return list(load_video(Path(source).expanduser(), fps=fps, max_views=max_views))
+    if fps is not None:
+        raise UserError("--fps is for videos; the source is none.")
+    if isinstance(source, list | tuple) and source and all(map(_is_photo, source)):
+        return _named_once([item for item in source if _is_photo(item)])
+    found = find_photos(source)
+    if len(found) > max_views:
+        logger.info("%d photos found, %d kept, evenly spaced (--max-views)", len(found), max_views)
+        found = [found[i] for i in evenly_spaced(len(found), max_views)]
+    paths = [item for item in found if isinstance(item, Path)]
+    names = dict(zip(paths, unique_names(paths), strict=True))
+    return _named_once([Photo(names[item], item, _size_hw(item)) if isinstance(item, Path) else item for item in found])
+
+
+def _is_photo(item: Any) -> TypeGuard[PhotoLike]:
+    return all(hasattr(item, name) for name in ("name", "size_hw", "read"))
+
+
+def _named_once(photos: Sequence[PhotoLike]) -> list[PhotoLike]:
+    """Return the photos; UserError when two have the same name."""
+    names = [photo.name for photo in photos]
+    twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
+    if twice is not None:
+        raise UserError(f"two photos have the name {twice}. Name each photo once.")
+    return list(photos)
 
 
 def evenly_spaced(count: int, keep: int) -> list[int]:
@@ -70,19 +128,65 @@ def evenly_spaced(count: int, keep: int) -> list[int]:
     return [round(i) for i in np.linspace(0, count - 1, min(count, keep))]
 
 
-def find_photos(source: str | Path | Sequence[str | Path]) -> list[Path]:
-    """List the photo files of a source; a list keeps its order, a folder or glob is sorted naturally."""
-    if not isinstance(source, str | Path):
-        return [_checked_file(Path(path)) for path in source] or _no_photos("the list of photos")
-    folder = Path(source)
-    if folder.is_dir():
-        return _folder_photos(folder)
-    if folder.is_file():
-        return [_checked_file(folder)]
+def find_photos(source: PhotoSource) -> Sequence[Path | PhotoLike]:
+    """List the photos of a source; a list keeps its order, a folder or pattern is sorted naturally."""
+    if isinstance(source, str | Path):
+        return _found_files(source)
+    if _is_pillow(source) or (isinstance(source, np.ndarray) and source.ndim < 4):
+        source = [source]
+    if not isinstance(source, Iterable):
+        raise UserError(
+            f"photos are a folder, a pattern, a video, or a list of files or images, not {_kind(source)}. "
+            "See freegeo.load_photos."
+        )
+    return [_listed(item, position) for position, item in enumerate(source)] or _no_photos("the list of photos")
+
+
+def _found_files(source: str | Path) -> list[Path]:
+    if not str(source):
+        raise UserError("the name of the photos is empty. Give a folder of photos, a glob or a photo.")
+    path = Path(source).expanduser()
+    if path.is_dir():
+        return _folder_photos(path)
+    if path.is_file():
+        return [_checked_file(path)]
     if glob.has_magic(str(source)):
-        matches = [Path(path) for path in glob.glob(str(source), recursive=True)]  # noqa: PTH207 (absolute patterns too)
+        matches = [Path(found) for found in glob.glob(str(path), recursive=True)]  # noqa: PTH207 (absolute patterns too)
         return sorted((_checked_file(p) for p in matches if p.is_file()), key=natural_key) or _no_photos(str(source))
     raise UserError(f"{source}: no such folder, file or pattern. Give a folder of photos, a glob or a photo.")
+
+
+def _listed(item: Any, position: int) -> Path | PhotoLike:
+    """Return an element of a list of photos as a file or a photo in memory."""
+    name = f"image-{position:03d}"
+    if isinstance(item, str | Path):
+        return _checked_file(Path(item).expanduser())
+    if isinstance(item, np.ndarray):
+        if item.dtype != np.uint8 or item.ndim != 3 or item.shape[2] != 3 or not item.size:
+            raise UserError(
+                f"{name} is an array of {item.dtype} and shape {item.shape}; "
+                "give arrays of uint8 and shape (height, width, 3), RGB from 0 to 255."
+            )
+        return MemoryPhoto(name, item.copy())
+    if _is_pillow(item):
+        from PIL import ImageOps
+
+        return MemoryPhoto(name, np.array(_to_rgb(ImageOps.exif_transpose(item))))
+    if _is_photo(item):
+        return item
+    raise UserError(
+        f"element {position} of the photos is {_kind(item)}; give file names, PIL images or uint8 arrays (H, W, 3)."
+    )
+
+
+def _is_pillow(item: Any) -> TypeGuard[PillowImage]:
+    from PIL import Image
+
+    return isinstance(item, Image.Image)
+
+
+def _kind(value: object) -> str:
+    return "None" if value is None else f"of the type {type(value).__name__}"
 
 
 def natural_key(path: Path) -> list[tuple[int, int | str]]:

@@ -11,13 +11,17 @@ import shutil
 import tempfile
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.export.base import Export, Format
 from freegeo.export.pixels import corner_K, corner_pixels
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.fusion.tracks import Tracks
+
+if TYPE_CHECKING:
+    from freegeo.fusion.tracks import Tracks
 
 FOLDER = Path("colmap") / "sparse" / "0"
 
@@ -99,3 +103,18 @@ def _rigid(T: np.ndarray) -> np.ndarray:
     """(3, 4) float64 with a rotation that is orthogonal to double precision."""
     u, _, vh = np.linalg.svd(T[:3, :3].astype(np.float64))
     return np.concatenate((u @ vh, T[:3, 3:].astype(np.float64)), axis=1)
+
+
+def _write(export: Export) -> list[Path]:
+    from freegeo.fusion.tracks import build_tracks
+
+    r = export.reconstruction
+    T_cam_world, K = r.cameras()
+    tracks = build_tracks(
+        r.depth_z, T_cam_world, K, r.images, export.keep, tolerance=export.tolerance, max_points=export.max_tracks,
+        seed=export.seed,
+    )  # fmt: skip
+    return write_colmap(r, tracks, export.folder / FOLDER)
+
+
+FORMAT = Format(name="colmap", path=FOLDER.parts[0], about="COLMAP model with tracks", write=_write)

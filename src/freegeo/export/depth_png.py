@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from freegeo import files
+from freegeo.export.base import Export, Format
 from freegeo.export.reconstruction import Reconstruction
 
 FOLDER = "depth"
@@ -44,3 +45,10 @@ def depth_names(names: tuple[str, ...]) -> list[str]:
     """File names of the maps: the photos' with the suffix .png, added to the old one where photos differ in it only."""
     short = [str(PurePosixPath(name).with_suffix(".png")) for name in names]
     return short if len(set(short)) == len(names) else [f"{name}.png" for name in names]
+
+
+def _write(export: Export) -> list[Path]:
+    return write_depth(export.reconstruction, export.folder / FOLDER)
+
+
+FORMAT = Format(name="depth", path=FOLDER, about="16-bit depth images", write=_write, needs_cameras=False)

@@ -1,142 +1,57 @@
-"""The table of export formats, and the one function that writes any of them."""
+"""The export formats, and the one function that writes any of them.
+
+A new format is a module beside this one that declares its `FORMAT`, and an entry in `FORMATS`. Help texts, checks and
+lists of written files follow from that.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from freegeo.errors import UserError
 from freegeo.export import colmap, depth_png, glb, mesh, nerfstudio, ply
-from freegeo.export.reconstruction import FILE_NAME, Reconstruction
-from freegeo.fusion.agreement import TOLERANCE_RANGE
-from freegeo.fusion.filtering import FilterReport, FilterSettings, filter_pixels
-from freegeo.fusion.points import MAX_POINTS, PointCloud, coloured_points
-from freegeo.fusion.tracks import build_tracks
+from freegeo.export import reconstruction as npz
+from freegeo.export.base import MAX_TRACKS, Export, Format
+from freegeo.fusion.settings import MAX_POINTS, FilterSettings
+
+if TYPE_CHECKING:
+    from freegeo.export.reconstruction import Reconstruction
+    from freegeo.fusion.filtering import FilterReport
 
 logger = logging.getLogger(__name__)
 
-MAX_TRACKS = 100_000
+_MODULES = (npz, ply, glb, mesh, colmap, nerfstudio, depth_png)
+FORMATS: dict[str, Format] = {module.FORMAT.name: module.FORMAT for module in _MODULES}
+ALL = "all"
+"""Stands for every format."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Job:
-    """What the writers of one export share; points are lifted once."""
-
-    reconstruction: Reconstruction
-    folder: Path
-    keep: np.ndarray
-    tolerance: float
-    max_points: int | None
-    max_tracks: int | None
-    voxel: float | None
-    photo_folder: str
-    seed: int
-
-    @cached_property
-    def cloud(self) -> PointCloud:
-        """The kept pixels as points."""
-        r = self.reconstruction
-        T_cam_world, K = r.cameras()
-        return coloured_points(
-            r.depth_z,
-            r.conf,
-            T_cam_world,
-            K,
-            r.images,
-            keep=self.keep,
-            drop_share=0.0,
-            drop_flying=False,
-            max_points=self.max_points,
-            seed=self.seed,
-        )
-
-    @cached_property
-    def points_file(self) -> Path:
-        """`points.ply`, written when it is first asked for."""
-        return ply.write_ply(self.cloud, self.folder / ply.FILE_NAME)
-
-
-def _npz(job: Job) -> list[Path]:
-    return [job.reconstruction.save(job.folder / FILE_NAME)]
-
-
-def _ply(job: Job) -> list[Path]:
-    return [job.points_file]
-
-
-def _glb(job: Job) -> list[Path]:
-    T_cam_world, K = job.reconstruction.cameras()
-    return [glb.write_glb(job.cloud, T_cam_world, K, job.reconstruction.image_hw, job.folder / glb.FILE_NAME)]
-
-
-def _mesh(job: Job) -> list[Path]:
-    return [mesh.write_mesh(job.reconstruction, job.keep, job.folder / mesh.FILE_NAME, voxel=job.voxel)]
-
-
-def _colmap(job: Job) -> list[Path]:
-    r = job.reconstruction
-    T_cam_world, K = r.cameras()
-    tracks = build_tracks(
-        r.depth_z,
-        T_cam_world,
-        K,
-        r.images,
-        job.keep,
-        tolerance=job.tolerance,
-        max_points=job.max_tracks,
-        seed=job.seed,
-    )
-    return colmap.write_colmap(r, tracks, job.folder / colmap.FOLDER)
-
-
-def _nerfstudio(job: Job) -> list[Path]:
-    points, file = job.points_file, job.folder / nerfstudio.FILE_NAME
-    nerfstudio.write_nerfstudio(job.reconstruction, file, photo_folder=job.photo_folder, points=points.name)
-    return [file, points]
-
-
-def _depth(job: Job) -> list[Path]:
-    return depth_png.write_depth(job.reconstruction, job.folder / depth_png.FOLDER)
-
-
-WRITERS: dict[str, Callable[[Job], list[Path]]] = {
-    "npz": _npz,
-    "ply": _ply,
-    "glb": _glb,
-    "mesh": _mesh,
-    "colmap": _colmap,
-    "nerfstudio": _nerfstudio,
-    "depth": _depth,
-}
-NEEDS_CAMERAS = frozenset({"ply", "glb", "mesh", "colmap", "nerfstudio"})
-
-
-def check_formats(formats: Sequence[str]) -> None:
-    """Raise UserError for a format that does not exist."""
-    for name in formats:
-        if name not in WRITERS:
-            raise UserError(f"Unknown export format '{name}'. Choose from {', '.join(WRITERS)}.")
+def chosen_formats(names: Iterable[str]) -> list[str]:
+    """Return the formats that are meant, each once; UserError for one that does not exist."""
+    chosen: list[str] = []
+    for name in names:
+        if name != ALL and name not in FORMATS:
+            raise UserError(f"Unknown export format '{name}'. Choose from {', '.join(FORMATS)}.")
+        chosen += FORMATS if name == ALL else [name]
+    return list(dict.fromkeys(chosen))
 
 
 def filter_reconstruction(
     reconstruction: Reconstruction, *, masks: np.ndarray | None = None, settings: FilterSettings | None = None
 ) -> tuple[np.ndarray, FilterReport]:
     """Pixels of a reconstruction to believe (S, H, W) bool, and what was removed; arguments as `filter_pixels`."""
+    from freegeo.fusion.filtering import filter_pixels
+
     T_cam_world, K = reconstruction.cameras()
     return filter_pixels(
-        reconstruction.depth_z,
-        reconstruction.conf,
-        T_cam_world,
-        K,
-        sky=reconstruction.sky,
-        masks=masks,
+        reconstruction.depth_z, reconstruction.conf, T_cam_world, K, sky=reconstruction.sky, masks=masks,
         settings=settings,
-    )
+    )  # fmt: skip
 
 
 def export(
@@ -156,7 +71,7 @@ def export(
     Args:
         reconstruction: what to write.
         folder: where the files appear.
-        formats: names of `WRITERS`.
+        formats: names of `FORMATS`, or `all`.
         filtered: result of `filter_reconstruction`; default: filtered here with the default settings.
         max_points: of `points.ply` and `scene.glb`; None writes all.
         max_tracks: points of the COLMAP model; None writes all.
@@ -171,14 +86,15 @@ def export(
         UserError: an unknown format, a missing extra, or 3D formats of a reconstruction without cameras.
         FreeGeoError: nothing is left to write.
     """
-    check_formats(formats)
-    keep = np.ones(reconstruction.depth_z.shape, dtype=bool)
-    tolerance = None
-    if NEEDS_CAMERAS & set(formats):
+    from freegeo.fusion.agreement import TOLERANCE_RANGE
+
+    wanted = [FORMATS[name] for name in chosen_formats(formats)]
+    keep, tolerance = np.ones(reconstruction.depth_z.shape, dtype=bool), None
+    if any(format.needs_cameras for format in wanted):
         keep, report = filtered or filter_reconstruction(reconstruction)
         tolerance = report.tolerance
         logger.info("filters: %s", report.summary())
-    job = Job(
+    run = Export(
         reconstruction=reconstruction,
         folder=Path(folder),
         keep=keep,
@@ -189,5 +105,4 @@ def export(
         photo_folder=photo_folder,
         seed=seed,
     )
-    written = [path for name in dict.fromkeys(formats) for path in WRITERS[name](job)]
-    return list(dict.fromkeys(written))
+    return list(dict.fromkeys(path for format in wanted for path in run.write(format)))

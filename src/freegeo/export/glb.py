@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from freegeo import files
+from freegeo.export.base import Export, Format
 from freegeo.export.ply import require_points
-from freegeo.fusion.points import PointCloud
+
+if TYPE_CHECKING:
+    from freegeo.fusion.points import PointCloud
 
 FILE_NAME = "scene.glb"
 FRUSTUM_SHARE = 0.08
@@ -106,3 +110,11 @@ def _beams(corners: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
         faces.append(np.array(_BOX_FACES) + 8 * len(faces))
         vertices.append(np.concatenate((corners[start] + ring, corners[end] + ring)))
     return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _write(export: Export) -> list[Path]:
+    T_cam_world, K = export.reconstruction.cameras()
+    return [write_glb(export.cloud, T_cam_world, K, export.reconstruction.image_hw, export.folder / FILE_NAME)]
+
+
+FORMAT = Format(name="glb", path=FILE_NAME, about="points and camera frusta", write=_write)

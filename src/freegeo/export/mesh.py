@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.export.base import Export, Format
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.fusion.mesh import Mesh
-from freegeo.fusion.tsdf import TsdfVolume
-from freegeo.geometry.camera import project
-from freegeo.geometry.se3 import transform_points
+
+if TYPE_CHECKING:
+    from freegeo.fusion.mesh import Mesh
 
 logger = logging.getLogger(__name__)
 
@@ -43,6 +43,10 @@ def voxel_size(reconstruction: Reconstruction, keep: np.ndarray) -> float:
 
 def fuse(reconstruction: Reconstruction, keep: np.ndarray, *, voxel: float) -> Mesh:
     """Surface of the kept pixels (S, H, W), fused view by view with a truncation of four voxels."""
+    import torch
+
+    from freegeo.fusion.tsdf import TsdfVolume
+
     T_cam_world, K = (torch.from_numpy(a) for a in reconstruction.cameras())
     volume = TsdfVolume(voxel=voxel, truncation=TRUNCATION_VOXELS * voxel)
     depth = torch.from_numpy(np.where(keep, reconstruction.depth_z, 0))
@@ -53,6 +57,11 @@ def fuse(reconstruction: Reconstruction, keep: np.ndarray, *, voxel: float) -> M
 
 def vertex_colours(mesh: Mesh, reconstruction: Reconstruction, keep: np.ndarray, *, tolerance: float) -> np.ndarray:
     """Colours (V, 3) uint8: mean of the views whose kept depth is within `tolerance` of a vertex; grey without one."""
+    import torch
+
+    from freegeo.geometry.camera import project
+    from freegeo.geometry.se3 import transform_points
+
     T_cam_world, K = (torch.from_numpy(a) for a in reconstruction.cameras())
     height, width = reconstruction.image_hw
     vertices = torch.from_numpy(mesh.vertices).float()
@@ -97,3 +106,10 @@ def write_mesh(reconstruction: Reconstruction, keep: np.ndarray, path: Path, *, 
     with files.atomic_path(path) as part:
         trimesh.Trimesh(mesh.vertices, mesh.triangles, vertex_colors=colours, process=False).export(part)
     return path
+
+
+def _write(export: Export) -> list[Path]:
+    return [write_mesh(export.reconstruction, export.keep, export.folder / FILE_NAME, voxel=export.voxel)]
+
+
+FORMAT = Format(name="mesh", path=FILE_NAME, about="surface", write=_write)

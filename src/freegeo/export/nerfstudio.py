@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from freegeo import files
+from freegeo.export import ply
+from freegeo.export.base import Export, Format
 from freegeo.export.pixels import corner_K
 from freegeo.export.reconstruction import Reconstruction
 
@@ -53,3 +55,12 @@ def write_nerfstudio(
     cloud = {"ply_file_path": points} if points else {}
     files.write_json(path, {"camera_model": "OPENCV", **distortion, **cloud, "frames": frames})
     return path
+
+
+def _write(export: Export) -> list[Path]:
+    (points,) = export.write(ply.FORMAT)
+    path = export.folder / FILE_NAME
+    return [write_nerfstudio(export.reconstruction, path, photo_folder=export.photo_folder, points=points.name), points]
+
+
+FORMAT = Format(name="nerfstudio", path=FILE_NAME, about="nerfstudio cameras", write=_write)

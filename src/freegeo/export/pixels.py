@@ -9,11 +9,9 @@ that know it; they keep every 3D point on the image content it was lifted from.
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from freegeo.errors import UserError
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.geometry.camera import photo_K
 
 HALF = 0.5
 
@@ -25,6 +23,10 @@ def corner_pixels(reconstruction: Reconstruction, view: np.ndarray, pixel: np.nd
 
 def corner_K(reconstruction: Reconstruction) -> np.ndarray:
     """Intrinsics (S, 3, 3) float64 of the original photos, with pixel centres at 0.5."""
+    import torch
+
+    from freegeo.geometry.camera import photo_K
+
     values = (reconstruction.cameras()[1].astype(np.float64), reconstruction.scale_xy, reconstruction.offset_xy - HALF)
     return photo_K(*map(torch.from_numpy, values)).numpy()
 

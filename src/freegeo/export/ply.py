@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from freegeo import files
 from freegeo.errors import FreeGeoError
-from freegeo.fusion.points import PointCloud
+from freegeo.export.base import Export, Format
+
+if TYPE_CHECKING:
+    from freegeo.fusion.points import PointCloud
 
 FILE_NAME = "points.ply"
 
@@ -25,3 +29,10 @@ def require_points(cloud: PointCloud, path: Path) -> None:
     """Raise FreeGeoError for an empty cloud."""
     if len(cloud) == 0:
         raise FreeGeoError(f"{path}: no point is left to write. Lower the confidence limit or switch filters off.")
+
+
+def _write(export: Export) -> list[Path]:
+    return [write_ply(export.cloud, export.folder / FILE_NAME)]
+
+
+FORMAT = Format(name="ply", path=FILE_NAME, about="coloured points", write=_write)

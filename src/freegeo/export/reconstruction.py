@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +29,8 @@ import numpy as np
 
 from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.export.base import DEFAULT_FORMATS, MAX_TRACKS, Export, Format
+from freegeo.fusion.settings import MAX_POINTS, FilterSettings
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -35,7 +38,7 @@ if TYPE_CHECKING:
     from freegeo.types import ImageBatch, Prediction
 
 FILE_NAME = "prediction.npz"
-FORMAT = 1
+VERSION = 1
 _OPTIONAL = ("T_cam_world", "K", "sky")
 _DTYPES = {"images": np.uint8, "photo_hw": np.int64, "scale_xy": np.float64, "offset_xy": np.float64}
 
@@ -87,6 +90,11 @@ class Reconstruction:
     def __len__(self) -> int:
         """Return the number of views."""
         return len(self.names)
+
+    def __repr__(self) -> str:
+        """Return the size of the result, not its arrays."""
+        cameras = "cameras" if self.has_cameras else "no cameras"
+        return f"Reconstruction({len(self)} views, {self.image_hw[1]} x {self.image_hw[0]} pixels, {cameras})"
 
     @property
     def image_hw(self) -> tuple[int, int]:
@@ -152,13 +160,55 @@ class Reconstruction:
         """Return the content of the file: every field that is there, under its name, and the format."""
         present = {f.name: getattr(self, f.name) for f in fields(self)}
         arrays = {name: np.asarray(value) for name, value in present.items() if value is not None}
-        return {**arrays, "format": np.array(FORMAT, np.int64)}
+        return {**arrays, "format": np.array(VERSION, np.int64)}
 
     def save(self, path: Path | str) -> Path:
         """Write the file (`prediction.npz` of `path` when that is a folder) atomically; returns where it is."""
         file = _file(path)
         files.write_npz(file, self.arrays())
         return file
+
+    def export(
+        self,
+        folder: Path | str,
+        formats: Sequence[str] = DEFAULT_FORMATS,
+        *,
+        filters: FilterSettings | None = None,
+        masks: list[np.ndarray] | None = None,
+        max_points: int | None = MAX_POINTS,
+        max_tracks: int | None = MAX_TRACKS,
+        voxel: float | None = None,
+        photo_folder: str = "images",
+        seed: int = 0,
+    ) -> list[Path]:
+        """Write files for other tools and return their paths.
+
+        Args:
+            folder: where they appear.
+            formats: names of `freegeo.export.formats.FORMATS`, or all.
+            filters: which points are kept; None: the defaults of `FilterSettings`.
+            masks: one (H, W) array per photo at its size, not zero where points are wanted.
+            max_points: of `points.ply` and `scene.glb`; None writes all.
+            max_tracks: points of the COLMAP model; None writes all.
+            voxel: voxel edge of the mesh in the reconstruction's units; None: from its resolution.
+            photo_folder: where nerfstudio finds the original photos, relative to `folder`.
+            seed: of the random choice of points.
+
+        Raises:
+            UserError: an unknown format, a missing extra, or formats with 3D points without cameras.
+            FreeGeoError: nothing is left to write.
+        """
+        from freegeo.export.formats import export, filter_reconstruction
+        from freegeo.export.pixels import masks_for_model
+
+        filtered = None
+        if self.has_cameras and (filters is not None or masks is not None):
+            wanted = None if masks is None else masks_for_model(self, masks)
+            filtered = filter_reconstruction(self, masks=wanted, settings=filters)
+        return export(
+            self, Path(folder).expanduser(), formats, filtered=filtered, max_points=max_points, max_tracks=max_tracks,
+            voxel=voxel, photo_folder=photo_folder, seed=seed,
+        )  # fmt: skip
 
     @classmethod
     def load(cls, path: Path | str) -> Reconstruction:
@@ -182,8 +232,8 @@ class Reconstruction:
 
     @classmethod
     def _from_arrays(cls, arrays: dict[str, np.ndarray], file: Path) -> Reconstruction:
-        version = int(arrays.get("format", FORMAT))
-        if version > FORMAT:
+        version = int(arrays.get("format", VERSION))
+        if version > VERSION:
             raise UserError(f"{file}: written by a newer freegeo (format {version}). Update freegeo.")
         names = [f.name for f in fields(cls)]
         missing = [name for name in names if name not in arrays and name not in _OPTIONAL]
@@ -196,8 +246,13 @@ class Reconstruction:
             raise FreeGeoError(f"{file}: not a reconstruction ({error}) Name another file.") from None
 
 
+def open_reconstruction(path: Path | str) -> Reconstruction:
+    """Read a stored reconstruction, from its file or the output folder of a run; errors as `Reconstruction.load`."""
+    return Reconstruction.load(path)
+
+
 def _file(path: Path | str) -> Path:
-    path = Path(path)
+    path = Path(path).expanduser()
     return path if path.suffix == ".npz" else path / FILE_NAME
 
 
@@ -209,3 +264,10 @@ def _to_numpy(tensor: Tensor | None, *, trailing: int) -> np.ndarray | None:
     if tensor.ndim != trailing:
         raise FreeGeoError(f"One reconstruction holds one scene, got a prediction of shape {tuple(tensor.shape)}.")
     return np.ascontiguousarray(tensor.detach().float().cpu().numpy())
+
+
+def _write(export: Export) -> list[Path]:
+    return [export.reconstruction.save(export.folder)]
+
+
+FORMAT = Format(name="npz", path=FILE_NAME, about="depth, confidence, cameras", write=_write, needs_cameras=False)

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from freegeo.errors import UserError
 from freegeo.fusion.agreement import prepare, tolerance_of, vote
+from freegeo.fusion.settings import FilterSettings
 from freegeo.geometry.depth import valid_depth
 
-__all__ = ["FilterReport", "FilterSettings", "confident_pixels", "filter_pixels", "flying_pixels"]
+__all__ = ["FilterReport", "confident_pixels", "filter_pixels", "flying_pixels"]
 
 CONTINUATION_TOLERANCE = 0.03
 """Largest relative distance of a pixel from the straight continuation of its neighbours."""
@@ -21,35 +22,6 @@ SMALL_STEP = 0.015
 """Relative step to the next pixel that shows a surface without asking for a straight line."""
 STEEPEST_SLOPE = 12.0
 """Tangent of the steepest angle (85 degrees) between a surface and the image plane that is believed."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FilterSettings:
-    """Which filters run, and how strictly."""
-
-    drop_share: float = 0.4
-    """Least confident share of the pixels to remove, 0 to below 1; 0 switches the filter off."""
-    flying: bool = True
-    """Remove pixels between surfaces."""
-    multi_view: bool = True
-    """Remove pixels that more views contradict than confirm."""
-    min_agreeing: int = 0
-    """Other views that must agree with a pixel. 0 keeps what one view alone sees; more makes sparse, sure clouds."""
-    min_asked: int = 1
-    """`min_agreeing` is asked only of pixels whose point falls into this many other images; 0: of all pixels."""
-    tolerance: float | None = None
-    """Relative depth difference of one surface in two views; None reads it off the data."""
-    sky_limit: float = 0.5
-    """Remove pixels with at least this much sky, where the model gives it; above 1 switches the filter off."""
-
-    def __post_init__(self) -> None:
-        """Raise UserError for values outside their ranges."""
-        if not 0 <= self.drop_share < 1:
-            raise UserError(f"The share of points to drop must be from 0 to below 1, got {self.drop_share}.")
-        if self.tolerance is not None and not self.tolerance > 0:
-            raise UserError(f"The depth tolerance between views must be positive, got {self.tolerance}.")
-        if self.min_agreeing < 0 or self.min_asked < 0:
-            raise UserError(f"Views must be counted from 0, got {self.min_agreeing} and {self.min_asked}.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,13 +9,10 @@ import torch
 
 from freegeo.errors import UserError
 from freegeo.fusion.filtering import confident_pixels, flying_pixels
+from freegeo.fusion.settings import DROP_SHARE, MAX_POINTS
 from freegeo.geometry.depth import depth_to_world, valid_depth
 
 __all__ = ["PointCloud", "coloured_points", "thin_points"]
-
-DROP_SHARE = 0.4
-"""Least confident share of the pixels that exports leave out, as the published ones do."""
-MAX_POINTS = 1_000_000
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from freegeo.errors import UserError
+from freegeo.files import write_tensors
 from freegeo.models.spec import KeyRules
 
 Model = TypeVar("Model", bound=nn.Module)
@@ -104,6 +105,12 @@ def load_weights(model: nn.Module, path: Path, rules: KeyRules, model_name: str)
     model.load_state_dict(state, assign=True)
     for parameter in model.parameters():
         parameter.requires_grad_(False)
+
+
+def save_weights(model: nn.Module, path: Path, rules: KeyRules, metadata: Mapping[str, str]) -> None:
+    """Write a model's weights as safetensors under the names of its official checkpoint; `load_weights` reads them."""
+    state = model.state_dict()
+    write_tensors(path, {name: state[ours] for ours, name in rules.file_names(state).items()}, metadata)
 
 
 def _require_finite(tensors: Mapping[str, Tensor], path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -60,6 +60,10 @@ class KeyRules:
         has_prefix = bool(self.prefix) and any(name.startswith(self.prefix) for name in names)
         ours = {(name.removeprefix(self.prefix) if has_prefix else name): name for name in names}
         return {our: name for our, name in ours.items() if not our.startswith(self.skipped or ("\0",))}
+
+    def file_names(self, names: Iterable[str]) -> dict[str, str]:
+        """Return our name -> file name for a file that leaves the aliases out, which `translate` reads back."""
+        return {name: self.prefix + name for name in names if name not in self.aliases}
 
 
 @dataclass(frozen=True, kw_only=True)

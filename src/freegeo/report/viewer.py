@@ -217,7 +217,7 @@ class Viewer:
         client.send_file_download("freegeo.png", buffer.getvalue(), save_immediately=True)
 
 
-def open_viewer(folders: Sequence[Path], *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
+def open_viewer(folders: Sequence[Path], *, host: str = "127.0.0.1", port: int) -> Viewer:
     """Serve one or two output folders of the same photos; returns at once, the server runs in a thread of its own.
 
     Args:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from freegeo.data.procedural.domains import DOMAINS, Domain, get_domain
-from freegeo.data.procedural.photographs import RenderedPhoto, photograph_room
+from freegeo.data.procedural.photographs import photograph_room
 from freegeo.data.procedural.raytrace import RenderedViews, intrinsics, render, resized_intrinsics
 from freegeo.data.procedural.rooms import RoomBatch, sample_rooms
 
 __all__ = [
     "DOMAINS",
     "Domain",
-    "RenderedPhoto",
     "RenderedViews",
     "RoomBatch",
     "get_domain",

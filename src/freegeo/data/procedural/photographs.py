@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from torch import Tensor
 
+from freegeo.data.photos import MemoryPhoto
 from freegeo.data.procedural.domains import Domain, get_domain
 from freegeo.data.procedural.raytrace import render
 from freegeo.data.procedural.rooms import sample_rooms
@@ -18,29 +18,11 @@ PHOTO_HW: dict[str, tuple[int, int]] = {"1:1": (192, 192), "4:3": (192, 256), "3
 SUPERSAMPLE = 2
 
 
-@dataclass(frozen=True)
-class RenderedPhoto:
-    """A photograph in memory."""
-
-    name: str
-    pixels: np.ndarray
-    """(H, W, 3) uint8."""
-
-    @property
-    def size_hw(self) -> tuple[int, int]:
-        """Height and width."""
-        return self.pixels.shape[0], self.pixels.shape[1]
-
-    def read(self) -> np.ndarray:
-        """Return the pixels (H, W, 3) uint8."""
-        return self.pixels
-
-
 def photograph_room(seed: int, domain: str | Domain, frames: int = 16, aspect: Aspect = "4:3") -> Scene:
     """Photograph one room along its camera path; depth and cameras are exact at the photos' size."""
     domain = get_domain(domain)
     views = render(sample_rooms([seed], domain=domain, frames=frames), *PHOTO_HW[aspect], supersample=SUPERSAMPLE)
-    photos = tuple(RenderedPhoto(f"{i:02d}.png", _to_bytes(image)) for i, image in enumerate(views.images[0]))
+    photos = tuple(MemoryPhoto(f"{i:02d}.png", _to_bytes(image)) for i, image in enumerate(views.images[0]))
     return Scene(
         name=f"{domain.name}-{seed}",
         photos=photos,

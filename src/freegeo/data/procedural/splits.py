@@ -19,8 +19,9 @@ import numpy as np
 import torch
 
 from freegeo.data.datasets.base import Dataset, DatasetConstants
+from freegeo.data.photos import MemoryPhoto
 from freegeo.data.procedural.domains import DOMAINS, get_domain
-from freegeo.data.procedural.photographs import RenderedPhoto, photograph_room
+from freegeo.data.procedural.photographs import photograph_room
 from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import atomic_path, write_npz
@@ -71,7 +72,7 @@ def load_room(domain: str, root: Path, name: str) -> Scene:
     if not (images.is_file() and points.is_file()):
         _render(int(name), domain, images, points)
     arrays = _read(images)
-    photos = tuple(RenderedPhoto(f"{i:02d}.png", pixels) for i, pixels in enumerate(arrays["photos"]))
+    photos = tuple(MemoryPhoto(f"{i:02d}.png", pixels) for i, pixels in enumerate(arrays["photos"]))
     return Scene(
         name=name,
         photos=photos,

@@ -1,0 +1,74 @@
+"""`freegeo adapter`: what can be done with a saved adapter besides reconstructing with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+
+from freegeo.cli import console
+from freegeo.cli.jobs import adapter_identity
+from freegeo.errors import UserError
+
+app = App(name="adapter", help="Fold a saved adapter into the weights of its model.", help_format="plaintext")
+SUFFIX = ".safetensors"
+
+
+@app.command
+def merge(
+    adapter: Path,
+    *,
+    output: Annotated[Path, Parameter(name=("--output", "-o"))],
+    strength: float = 1.0,
+    model: str | None = None,
+    checkpoint: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Fold an adapter into the weights of its model: a weight file for --checkpoint that needs no adapter.
+
+    The file has the layout of the model's official checkpoint and the licence of its weights.
+
+    Parameters
+    ----------
+    adapter
+        Folder of a saved adapter.
+    output
+        The weight file, FILE.safetensors.
+    strength
+        0 is the frozen model, 1 the adapted one, and between them the weights are interpolated.
+    model
+        Catalog name; default: the model that the adapter was made for.
+    checkpoint
+        Local weight file or folder of the model, instead of the download.
+    overwrite
+        Replace an existing file.
+    """
+    if output.suffix != SUFFIX:
+        raise UserError(f"{output}: merged weights are written as {SUFFIX}. Choose such a name.")
+    if output.exists() and not overwrite:
+        raise UserError(f"{output}: exists already. Add --overwrite to replace it, or choose another name.")
+    identity = adapter_identity(adapter)
+    from freegeo.adaptation.adapter_files import adapter_metadata, load_adapter
+    from freegeo.models import catalog
+    from freegeo.models.checkpoints import fingerprint, save_weights
+
+    metadata = adapter_metadata(adapter)
+    name = model or (metadata["base"]["model"] if metadata else None)
+    if name is None:
+        raise UserError(f"{adapter}: does not say which model it was made for. Name that with --model.")
+    loaded = catalog.load_model(name, checkpoint=checkpoint)
+    folded = load_adapter(loaded, adapter)
+    folded.set_strength(strength)
+    folded.merge()
+    spec, base = loaded.spec, loaded.loaded_from
+    assert base is not None
+    about = {
+        "format": "pt", "model": name, "licence": spec.weights_licence, "base": base.fingerprint,
+        "adapter": identity["weights"], "strength": f"{strength:g}",
+    }  # fmt: skip
+    save_weights(loaded, output, catalog.entry(name).keys, about)
+    console.say(f"{output}: {console.size(output)}, fingerprint {fingerprint(output)}")
+    console.say(f"licence of the weights: {spec.weights_licence}")
+    reference = "" if spec.reference == "first" else " --reference first"
+    console.say(f"use it: freegeo reconstruct PHOTOS -o OUT --model {name} --checkpoint {output}{reference}")

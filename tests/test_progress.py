@@ -1,0 +1,90 @@
+"""Progress: a bar where it can be drawn, lines elsewhere, and time left that does not count what was done before."""
+
+import sys
+from types import SimpleNamespace
+
+import pytest
+import rich.console
+import torch
+
+from freegeo import progress
+from freegeo.adaptation.adapt import Progress
+
+
+def test_progress_without_a_terminal_is_a_line_per_tenth(capsys):
+    with progress.progress_bar("steps", 40) as update:
+        update(0, "getting ready")
+        for k in range(40):
+            update(k + 1, f"loss {k}")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 11
+    assert lines[0] == "steps: 0/40, getting ready", "nothing is known of the time that is left"
+    assert lines[-1].startswith("steps: 40/40, 0 s left")
+
+
+def test_progress_of_a_resumed_run_does_not_take_the_earlier_part_for_speed(capsys, monkeypatch):
+    clock = iter([0.0, 0.0, 10.0, 10.0])
+    monkeypatch.setattr("time.monotonic", lambda: next(clock))
+    with progress.progress_bar("steps", 100) as update:
+        update(60)
+        update(70)
+    assert capsys.readouterr().err.splitlines() == ["steps: 60/100", "steps: 70/100, 30 s left"]
+
+
+class Shown:
+    """A stand-in for stderr that claims to be a terminal."""
+
+    def __init__(self):
+        self.text = ""
+
+    def write(self, text: str) -> int:
+        self.text += text
+        return len(text)
+
+    def flush(self) -> None:
+        """Nothing waits."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_progress_in_a_terminal_is_a_bar_that_keeps_its_text(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Shown())
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    with progress.progress_bar("steps", 4) as update:
+        update(1, "loss 0.5")
+        update(4)
+    last = sys.stderr.text.rpartition("steps")[2]
+    assert "4/4" in last
+    assert "loss 0.5" in last
+
+
+@pytest.mark.parametrize(("widgets", "expected"), [(True, True), (False, False)])
+def test_a_notebook_has_a_bar_where_widgets_are_installed(monkeypatch, widgets, expected):
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace())
+    monkeypatch.setattr(progress, "find_spec", lambda name: object() if widgets else None)
+    monkeypatch.setattr(rich.console, "_is_jupyter", lambda: True)
+    assert progress.in_notebook() is expected
+
+
+def test_steps_are_followed_from_the_first_to_the_last(capsys):
+    followed = []
+    with progress.step_bar(followed.append) as on_step:
+        for step in range(20):
+            on_step(Progress(step=step, steps=20, epoch=0, terms={"total": torch.tensor(step / 10)}))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "adapting: 1/20, loss 0.0000"
+    assert "adapting: 20/20" in lines[-1] and lines[-1].endswith("loss 1.9000")
+    assert [state.step for state in followed] == list(range(20))
+
+
+def test_a_run_that_fails_leaves_no_bar_behind(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Shown())
+    monkeypatch.setenv("TERM", "xterm")
+    hidden, visible = "\x1b[?25l", "\x1b[?25h"
+    with pytest.raises(RuntimeError), progress.step_bar() as on_step:
+        on_step(Progress(step=0, steps=3, epoch=0, terms={"total": torch.tensor(1.0)}))
+        assert sys.stderr.text.count(hidden) > sys.stderr.text.count(visible)
+        raise RuntimeError
+    assert sys.stderr.text.count(hidden) == sys.stderr.text.count(visible)
