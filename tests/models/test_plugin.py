@@ -79,7 +79,9 @@ def test_listing_it_does_not_import_its_architecture():
 def test_it_loads_with_the_weights_it_ships():
     model = load()
     drawn = importlib.import_module("freegeo_toy.weights").draw()
-    assert all(torch.equal(value, drawn[name].float()) for name, value in model.state_dict().items())
+    # The last bit of a normal number depends on the processor; rounded to half, that is the next number at most.
+    for name, value in model.state_dict().items():
+        torch.testing.assert_close(value, drawn[name].float(), rtol=2**-10, atol=2**-24)
     assert (model.loaded_from.model, model.loaded_from.licence) == ("toy", "Apache-2.0")
     assert sum(parameter.numel() for parameter in model.parameters()) == catalog.entry("toy").parameters
     assert model.spec.name == catalog.entry("toy").name
