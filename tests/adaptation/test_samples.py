@@ -105,37 +105,52 @@ def test_a_view_s_tokens_do_not_depend_on_the_views_beside_it():
         assert torch.equal(every.tokens[:, number], alone.tokens[:, 0])
 
 
-def test_images_are_loaded_once_per_view_set_in_the_background():
-    calls, model = [], tiny_da3()
-    samples, visits = opened(model, [recorded_scene(calls)], quick(model, epochs=3))
+@pytest.mark.parametrize("place", ["device", "disk"])
+def test_images_are_loaded_and_embedded_once_in_the_background(place, tmp_path):
+    calls, embedded, model = [], [], tiny_da3()
+    embed = model.embed
+    model.embed = lambda images, **options: embedded.append(images.shape[1]) or embed(images, **options)
+    recipe = quick(model, epochs=3)
+    samples, visits = opened(model, [recorded_scene(calls)], recipe, place, tmp_path)
     for visit in visits:
         samples.take(visit)
     samples.close()
-    assert len(calls) == 3
+    frames = [frame for _, part in calls for frame in part]
+    used = {frame for visit in visits for frame in visit.view_set.frames}
+    assert sorted(frames) == sorted(used)
+    assert sum(embedded) == len(used) < 3 * 8
     assert all(name.startswith("freegeo-images") for name, _ in calls)
 
 
+def test_augmented_images_are_embedded_for_every_set():
+    calls, model = [], tiny_vggt()
+    recipe = released("released-vggt", "eth3d").changed(epochs=2, sets_per_scene=2, rank=2, batch=1)
+    samples, visits = opened(model, [recorded_scene(calls)], recipe)
+    for visit in visits:
+        samples.take(visit)
+    samples.close()
+    assert [list(frames) for _, frames in calls] == [list(visit.view_set.frames) for visit in visits]
+
+
 def test_loading_runs_ahead_keeps_the_order_and_hands_errors_on():
-    model, calls, images = tiny_da3(), [], noise(9)
+    calls, images = [], noise(9)
     started = threading.Event()
 
     def load(frames):
         calls.append(tuple(frames))
         if len(calls) == 2:
             started.set()
-        if len(calls) == 3:
+        if 8 in frames:
             raise FreeGeoError("frame 8 is damaged")
         return images[list(frames)]
 
-    scene = SceneImages(name="s", count=9, load=load)
-    sets = [visit.view_set for visits in schedule([9], quick(model), 0) for visit in visits][:3]
-    loaded = loaded_ahead([scene], sets)
-    assert torch.equal(next(loaded), images[list(sets[0].frames)])
-    assert started.wait(10)  # the second set is loaded although nobody has asked for it
-    assert torch.equal(next(loaded), images[list(sets[1].frames)])
+    loaded = loaded_ahead([SceneImages(name="s", count=9, load=load)], [(0, (0, 1)), (0, (1, 2)), (0, (8,))])
+    assert torch.equal(next(loaded), images[[0, 1]])
+    assert started.wait(10)  # the second request is loaded although nobody has asked for it
+    assert torch.equal(next(loaded), images[[1, 2]])
     with pytest.raises(FreeGeoError, match="frame 8"):
         next(loaded)
-    assert calls == [view_set.frames for view_set in sets]
+    assert calls == [(0, 1), (1, 2), (8,)]
 
 
 def test_an_unreadable_image_stops_the_run_and_leaves_the_model_plain():

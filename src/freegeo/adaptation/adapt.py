@@ -138,7 +138,7 @@ def adapt(
         FreeGeoError: a loss or gradient that is not finite, or memory that ran out all the same.
     """
     steps = schedule([scene.count for scene in scenes], recipe, seed)
-    plan = plan or plan_adaptation(model, scenes, recipe, steps, compute=compute)
+    plan = plan or plan_adaptation(model, scenes, recipe, steps, compute=compute, folder=resume_in)
     run = _Run(model.adaptable(), scenes, recipe, steps, seed, compute, resume_in, on_step, on_epoch)
     try:
         return _train(run, plan)

@@ -22,7 +22,7 @@ from torch import nn
 from freegeo.adaptation.adapter import count_trainable
 from freegeo.adaptation.losses.numerics import CPU_BLOCK_ELEMENTS, DEVICE_BLOCK_ELEMENTS
 from freegeo.adaptation.recipe import Recipe
-from freegeo.adaptation.samples import Place, SceneImages, sample_key
+from freegeo.adaptation.samples import Place, SceneImages, distinct, sample_key, view_keys
 from freegeo.adaptation.views import ViewSet, Visit
 from freegeo.errors import UserError
 from freegeo.models.api import ReconstructionModel, views_per_chunk
@@ -123,6 +123,8 @@ class Footprint:
         teacher, learning = self._teacher(sample), self._learning(checkpointing)
         resident = [("weights", self.shape.parameters * WIDE), ("adapter and optimiser", 4 * WIDE * self.trained)]
         waiting = kept if place == "device" else sample
+        if place == "device":
+            resident.append(("tokens of shared images", self._shared_tokens()))
         # While the teacher runs for the last time, the sample that it makes is still missing among those kept.
         if teacher - sample > sum(size for _, size in learning):
             parts = [*resident, ("teacher features", max(0, waiting - sample)), ("teacher's pass", teacher)]
@@ -143,7 +145,9 @@ class Footprint:
             every = self._count(self.largest.frames)
             options.append(self._pass(every, WIDE * every * self.shape.channels, checkpointing))
             # The student's own tokens and targets are copies of a part of the sample.
-            options[0].append(("inputs of a step", self._sample(self.largest) * len(self.largest.kept) // 8))
+            options[0].append(
+                ("inputs of a step", self._sample(self.largest) * len(self.largest.kept) // len(self.largest.frames))
+            )
         return max(options, key=lambda parts: sum(size for _, size in parts))
 
     def _pass(self, tokens: int, losses: int, checkpointing: bool) -> list[tuple[str, int]]:
@@ -167,6 +171,12 @@ class Footprint:
         on_cpu = self.compute.device.type == "cpu"
         block = WIDE * (CPU_BLOCK_ELEMENTS if on_cpu else DEVICE_BLOCK_ELEMENTS)
         return level * self.layers + 4 * min(level, block) + TRIPLET_ARRAYS * WIDE * triplets
+
+    def _shared_tokens(self) -> int:
+        """Tokens of the images that several view sets use, which wait for the last of them."""
+        sets = distinct(self.visits, self.recipe)
+        uses = Counter(key for view_set in sets for key in view_keys(view_set, self.recipe))
+        return sum(self.shape.token_bytes(self.tokens[key[0]]) for key, count in uses.items() if count > 1)
 
     def _kept_peak(self) -> int:
         """Follow the samples through the run: one stays from its first visit to its last."""

@@ -1,7 +1,8 @@
 """What a step needs of a view set, made once with the frozen model: the left column of Algorithm 1, computed ahead.
 
-The teacher never changes, and neither does anything below the first cross-view layer. So both run once per view set;
-every later visit of the set costs the student's pass only (docs/method.md, "Roles and view sets").
+The teacher never changes, and neither does anything below the first cross-view layer. So images are embedded once, the
+teacher runs once per view set, and every later visit of the set costs the student's pass only (docs/method.md, "Roles
+and view sets").
 """
 
 from __future__ import annotations
@@ -10,8 +11,9 @@ import random
 import shutil
 import tempfile
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -173,9 +175,7 @@ class Samples:
         self._kept: dict[SampleKey, Sample] = {}
         self._folder = _empty_folder(folder) if place == "disk" else None
         self._files = 0
-        distinct = {sample_key(view_set, recipe): view_set for view_set in reversed(view_sets)}
-        in_order = dict.fromkeys(sample_key(view_set, recipe) for view_set in view_sets)
-        self._images = loaded_ahead(scenes, [distinct[key] for key in in_order])
+        self._tokens = self._embedded(scenes, distinct(view_sets, recipe))
 
     def take(self, visit: Visit) -> Sample:
         """Return the sample of a visit, on the device; visits come in the order of `steps`."""
@@ -192,20 +192,17 @@ class Samples:
 
     def close(self) -> None:
         """Stop decoding, drop everything and remove the files."""
-        self._images.close()
+        self._tokens.close()
         self._kept.clear()
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     @torch.no_grad()
     def _make(self, visit: Visit) -> Sample:
-        """Embed the views of a set and run the teacher on them."""
+        """Run the teacher on the views of a set."""
         view_set, config, model = visit.view_set, self._recipe.loss, self._adapter.model
-        images = next(self._images)
-        if self._recipe.augmentation == "released":
-            images = released_augmentation(images, view_set.seed)
+        tokens = next(self._tokens)
         with self._adapter.off(), self._compute.autocast():
-            tokens = embed_in_chunks(model, images, device=self._compute.device, layers=model.spec.loss_layers)
             features = loss_features(model, tokens)
         read = view_set.positions if self._recipe.hold else view_set.kept
         sample = Sample(
@@ -221,6 +218,32 @@ class Samples:
         spread = teacher_spread(levels[max(levels)], sample.held_out, draws, config)
         return replace(sample, form=choose_form(float(spread), headroom=SPREAD_HEADROOM))
 
+    def _embedded(self, scenes: Sequence[SceneImages], view_sets: Sequence[ViewSet]) -> Generator[ViewTokens]:
+        """Yield the tokens (1, N, ...) of view sets in order; an image that several sets use is embedded once."""
+        fresh, left = [], Counter[ViewKey]()
+        for view_set in view_sets:
+            keys = view_keys(view_set, self._recipe)
+            fresh.append([position for position, key in enumerate(keys) if key not in left])
+            left.update(keys)
+        requests = [(s.scene, [s.frames[p] for p in positions]) for s, positions in zip(view_sets, fresh, strict=True)]
+        device, layers = self._compute.device, self._adapter.model.spec.loss_layers
+        waiting: dict[ViewKey, ViewTokens] = {}
+        with closing(loaded_ahead(scenes, [request for request in requests if request[1]])) as images:
+            for view_set, positions in zip(view_sets, fresh, strict=True):
+                keys = view_keys(view_set, self._recipe)
+                if positions:
+                    pixels = next(images)
+                    if self._recipe.augmentation == "released":
+                        pixels = released_augmentation(pixels, view_set.seed)
+                    with self._compute.autocast():
+                        embedded = embed_in_chunks(self._adapter.model, pixels, device=device, layers=layers)
+                    home = "cpu" if self._folder else device
+                    waiting |= {keys[p]: embedded.select([n]).to(home) for n, p in enumerate(positions)}
+                tokens = ViewTokens.join_views([waiting[key] for key in keys]).to(device)
+                left.subtract(keys)
+                waiting = {key: view for key, view in waiting.items() if left[key]}
+                yield tokens
+
     def _in_file(self, sample: Sample) -> Sample:
         """Move a sample to a file; its tensors are read from there, by the system, when they are used."""
         from safetensors import safe_open
@@ -234,13 +257,28 @@ class Samples:
             return sample.with_tensors({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
 
 
-SampleKey = tuple[int, tuple[int, ...], tuple[int, ...], int | None]
+ViewKey = tuple[int, ...]
+SampleKey = tuple[tuple[ViewKey, ...], tuple[int, ...]]
+
+
+def view_keys(view_set: ViewSet, recipe: Recipe) -> list[ViewKey]:
+    """Return what each view's pixels depend on: scene and frame; if augmented, also the set and the position in it."""
+    if recipe.augmentation == "none":
+        return [(view_set.scene, frame) for frame in view_set.frames]
+    return [(view_set.scene, frame, view_set.seed, position) for position, frame in enumerate(view_set.frames)]
 
 
 def sample_key(view_set: ViewSet, recipe: Recipe) -> SampleKey:
-    """Return what a view set's pixels depend on: sets of equal key share a sample."""
-    variant = view_set.seed if recipe.augmentation != "none" else None
-    return view_set.scene, view_set.frames, view_set.kept, variant
+    """Return what a sample depends on: view sets of equal key share it."""
+    return tuple(view_keys(view_set, recipe)), view_set.kept
+
+
+def distinct(view_sets: Iterable[ViewSet], recipe: Recipe) -> list[ViewSet]:
+    """Return one view set of every key, in the order of first visits."""
+    found: dict[SampleKey, ViewSet] = {}
+    for view_set in view_sets:
+        found.setdefault(sample_key(view_set, recipe), view_set)
+    return list(found.values())
 
 
 def loss_features(model: ReconstructionModel, tokens: ViewTokens) -> Features:
@@ -260,18 +298,18 @@ def step_draws(sample: Sample, visit: Visit, config: LossConfig, *, seed: int) -
     ).to(patch.device)
 
 
-def loaded_ahead(scenes: Sequence[SceneImages], view_sets: Sequence[ViewSet]) -> Generator[Tensor]:
-    """Yield the images (N, 3, H, W) of view sets in order; a background thread loads the next ones meanwhile.
+def loaded_ahead(scenes: Sequence[SceneImages], requests: Iterable[tuple[int, Sequence[int]]]) -> Generator[Tensor]:
+    """Yield images (S, 3, H, W) for requests (scene, frames) in order; a background thread loads the next ones.
 
     Raises what loading raised. Closing the generator stops the thread.
     """
-    waiting, running = deque(view_sets), deque[Future[Tensor]]()
+    waiting, running = deque(requests), deque[Future[Tensor]]()
     thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="freegeo-images")
     try:
         while waiting or running:
             while waiting and len(running) < AHEAD:
-                view_set = waiting.popleft()
-                running.append(thread.submit(scenes[view_set.scene].load, view_set.frames))
+                scene, frames = waiting.popleft()
+                running.append(thread.submit(scenes[scene].load, frames))
             yield running.popleft().result()
     finally:
         thread.shutdown(cancel_futures=True)
