@@ -58,7 +58,7 @@ def _flush(path: Path) -> None:
 
 
 def _enter_in_ledger(path: Path) -> None:
-    """Note a file in the ledger of the run folder that it lies in, if it lies in one."""
+    """Add a file to the ledger of the run folder that it is in, if it is in one."""
     path = path.absolute()
     owner = next((folder for folder in path.parents if (folder / RUN_FILE).is_file()), None)
     if owner is not None and path.name not in OWN_FILES:

@@ -84,9 +84,9 @@ def reconstruct(
         adapter: an adapter of this model, or the folder of a saved one; it is used for this call, and the model is left
             as it was. None: the model in its present state, with the adapter that is on, if there is one.
         reference: rule of the reference view; None: the first view with an adapter, as in adaptation, else the model's.
-        device: cpu, cuda, cuda:N or mps; None: the best at hand.
+        device: cpu, cuda, cuda:N or mps; None: the best available.
         precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
-        max_views: most photos that are used; a list that `freegeo.load_photos` returned is used as it is.
+        max_views: most photos that are used; a list that `freegeo.load_photos` returned is used whole.
 
     Raises:
         UserError: an argument that cannot be used, or views that do not fit into memory together.
@@ -175,9 +175,9 @@ def adapt(
         sets: view sets per scene.
         loss: settings of the loss, such as `{"weight_kq": 0.0}`.
         seed: of everything random.
-        device: cpu, cuda, cuda:N or mps; None: the best at hand.
+        device: cpu, cuda, cuda:N or mps; None: the best available.
         precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
-        max_views: most photos that are used; a list that `freegeo.load_photos` returned is used as it is.
+        max_views: most photos that are used; a list that `freegeo.load_photos` returned is used whole.
         resume_in: folder for the state of an unfinished run: the same call continues it. `result.save` to that folder
             removes the state.
         progress: show a bar in a terminal or notebook, lines in a log file; without it nothing is printed.

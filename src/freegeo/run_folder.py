@@ -98,7 +98,7 @@ def run_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool = Fal
     Absent or empty: a run is started. Unfinished with the same settings: it continues. Finished with the same settings:
     `finished` is true and the caller must not write. Other settings, or a folder that freegeo did not write: UserError.
     `overwrite` removes what earlier runs wrote, and nothing else; a folder that freegeo did not write is still refused.
-    When the block raises UserError before it wrote a file, the folder is left as it was.
+    When the block raises UserError before it wrote a file, the settings file and a new folder are removed again.
     """
     settings = as_json(settings)
     check_folder(path, settings, overwrite=overwrite)
@@ -134,7 +134,7 @@ def _open(path: Path, settings: Mapping[str, Any], overwrite: bool) -> str | Non
 
 
 def check_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool) -> None:
-    """Raise UserError when `run_folder` would refuse; cheap, so that commands can ask before they load anything."""
+    """Raise UserError when `run_folder` would refuse; cheap, so that commands can check before they load anything."""
     settings = as_json(settings)
     if path.exists() and not path.is_dir():
         raise UserError(f"{path}: is a file. Choose a folder for the output.")

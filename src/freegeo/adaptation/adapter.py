@@ -247,7 +247,7 @@ class Adapter:
         _require_none(self.model)
         for name, layer in self.layers.items():
             for matrix in _matrices(layer):
-                # The model may have been moved meanwhile.
+                # The model may have been moved to another device since `detach`.
                 matrix.data = matrix.data.to(cast(nn.Linear, layer.base_layer).weight.device)
             self._put(name, cast(nn.Module, layer))
         self.model.peft_config = self._peft_config

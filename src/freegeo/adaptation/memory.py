@@ -35,7 +35,7 @@ Parts = tuple[tuple[str, int], ...]
 WIDE = 4
 """Bytes of a float32: the residual stream, norms, features, losses, trained parameters."""
 TRIPLET_ARRAYS = 13
-"""Arrays with one number per triplet that live together while the angle terms are computed."""
+"""Arrays with one number per triplet that exist at the same time while the angle terms are computed."""
 WIDEST_LEVELS = 4
 """Levels that the dense heads read."""
 
@@ -251,7 +251,7 @@ def shape_of(model: ReconstructionModel) -> Shape:
     part = model.adaptable()
     linears = [_base(part.get_submodule(name)) for name in part.adapter_targets()]
     attention = [linear for linear in linears if linear.out_features == 3 * linear.in_features]
-    # A third-party model may have no joint qkv layer; its first layer then stands for its width.
+    # A third-party model may have no joint qkv layer; then the width is taken from its first layer.
     width = (attention or linears)[0].in_features
     contraction = [linear for linear in linears if linear.out_features == width and linear.in_features != width]
     expansion = [linear for linear in linears if linear.in_features == width and linear.out_features > width]

@@ -25,7 +25,7 @@ PAPER_SEED = 42
 SEED = 43
 """Seed of everything else: adaptation to a user's own photos."""
 SMALLEST_SCENE = 3
-"""Fewest views of a scene: two that the student sees and one held out."""
+"""Fewest views of a view set: two that the student sees and one held out."""
 
 Selection = Literal["mixed", "topk", "random"]
 

@@ -89,8 +89,7 @@ def _resized(depth: Tensor, camera_hw: tuple[int, int], size_hw: tuple[int, int]
 
 
 def _masked(depth: Tensor, mask: np.ndarray | None) -> Tensor:
-    """Set depth that must not be fused to 0; with a mask, as published, a product that leaves NaN for NaN and infinity.
-    """
+    """Set depth that must not be fused to 0; with a mask by a product, as published: NaN and infinity become NaN."""
     if mask is None:
         return torch.where(depth.isfinite() & (depth > 0), depth, 0.0)
     if tuple(mask.shape) != tuple(depth.shape):

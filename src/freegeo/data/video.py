@@ -231,7 +231,7 @@ def _turned(size_hw: tuple[int, int], rotation: int) -> tuple[int, int]:
 
 
 def _upright(image: np.ndarray, rotation: int) -> np.ndarray:
-    """Turn pixels as the rotation metadata asks; angles that are no quarter turn are rounded to one."""
+    """Turn pixels by the rotation in the metadata, rounded to quarter turns."""
     return np.ascontiguousarray(np.rot90(image, _quarter_turns(rotation)))
 
 

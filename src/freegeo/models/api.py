@@ -1,7 +1,7 @@
 """The contract of a reconstruction model: embed, aggregate, decode (docs/architecture.md).
 
 `embed` sees one image at a time and is never adapted; `aggregate` mixes the views and is the only place where an
-adapter lives; `decode` turns the features of any selection of views into depth and cameras.
+adapter acts; `decode` turns the features of any selection of views into depth and cameras.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def check_want(want: Collection[str], offered: Collection[Want], model: str) -> 
 
 
 def level_tokens(features: Features, layers: Collection[int], model: str) -> list[tuple[Tensor, Tensor]]:
-    """Return the features of the layers a head reads; UserError when `aggregate` was told to leave one out."""
+    """Return the features of the layers a head reads; UserError when one is not in `features`."""
     missing = [layer for layer in layers if layer not in features.levels]
     if missing:
         raise UserError(

@@ -83,7 +83,7 @@ class Result:
 
     @property
     def predictions(self) -> list[Stage]:
-        """The stages without ground truth."""
+        """The stages other than ground truth."""
         return [stage for stage in self.stages.values() if stage.key != "truth"]
 
     @property

@@ -51,7 +51,7 @@ class TrainConfig:
     begin: tuple[int, int] = (0, 0)
     """Steps and views of the run that this one continues; (0, 0): a start from nothing."""
     peak: float = 1.0
-    """Factor on all learning rates; a run that continues a cooled one wants about 0.2."""
+    """Factor on all learning rates; a run that continues a cooled one needs about 0.2."""
     seed: int = 0
     side: int = 64
     """Longest image side in pixels."""

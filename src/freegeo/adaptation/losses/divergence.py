@@ -40,7 +40,7 @@ def choose_form(spread: float, *, headroom: float = 1.0) -> KLForm:
     """The cheapest safe evaluation for softmax inputs of this `spread` (see `pair_spread`).
 
     headroom: factor by which the spread may grow before the choice is unsafe; above 1 where the teacher's spread is
-    measured once and stands for a student that drifts from it.
+    measured once and also used for a student that drifts from it.
     """
     if spread * headroom <= FLOAT32_SPREAD:
         return "float32"

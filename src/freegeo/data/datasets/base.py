@@ -62,7 +62,7 @@ class Dataset:
     """(path, size of the photo): a depth file of `SceneTruth.depth`, (H, W) float32 metres, 0 or infinity where there
     is none. None: no depth files; a scene may carry its depth in memory."""
     valid_mask: Callable[[SceneTruth, int, tuple[int, int]], np.ndarray | None] | None = None
-    """(truth, frame, fusion size): pixels of the frame that may be fused, (H, W) bool, or None where nothing says so.
+    """(truth, frame, fusion size): pixels of the frame that may be fused, (H, W) bool, or None without any restriction.
     None: no frame has such a mask."""
     depth_of_every_frame: bool = True
     """Whether a frame without a depth file is a gap in the data."""

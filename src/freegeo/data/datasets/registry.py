@@ -53,7 +53,7 @@ def load_scene(data: Path, dataset: str, scene: str) -> Scene:
 
 
 def valid_mask(truth: SceneTruth, index: int, size_hw: tuple[int, int]) -> np.ndarray | None:
-    """Return the pixels of one frame that may be fused, (H, W) bool at fusion size; None where nothing says so."""
+    """Return the pixels of one frame that may be fused, (H, W) bool at fusion size; None without any restriction."""
     mask = get_dataset(truth.dataset).valid_mask
     return None if mask is None else mask(truth, index, size_hw)
 

@@ -39,7 +39,7 @@ class Domain:
     ambient: Range = (0.4, 0.62)
     """Share of the light that does not come from the lamp."""
     exposure: float = 1.0
-    """Factor on all light, as a longer exposure in a dim room; without it views would be black."""
+    """Factor on all light, like a longer exposure in a dim room, whose views would else be nearly black."""
     contrast: Range = (1.0, 1.0)
     """How far the second and third colour of a surface are from its first one: 0 makes the surface uniform."""
     saturation: float = 1.0
