@@ -156,7 +156,7 @@ def adapt(
     progress: bool = False,
     on_step: Callable[[Progress], None] = lambda progress: None,
 ) -> Adapted:
-    """Adapt a model to one scene's photos; the adapter stays in place (`result.adapter.detach()` takes it out).
+    """Adapt a model to one scene's photos; the adapter stays attached (`result.adapter.detach()` takes it out).
 
     Settings left at None are those of the recipe; they mean what the options of `freegeo adapt` mean.
 

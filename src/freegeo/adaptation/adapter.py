@@ -67,7 +67,7 @@ class PackedDropout(nn.Module):
 
 
 class Adapter:
-    """An adapter in place on a model: on by default, with strength 1.
+    """An adapter attached to a model: on by default, with strength 1.
 
     A fresh one changes nothing: LoRA's B matrices are zero and the camera token is a copy.
     """
@@ -92,7 +92,7 @@ class Adapter:
 
     @property
     def attached(self) -> bool:
-        """Whether the adapter is in place on its model, on or off."""
+        """Whether the adapter's layers are in its model, on or off."""
         name, layer = next(iter(self.layers.items()))
         return self.model.get_submodule(name) is layer
 
@@ -229,7 +229,7 @@ class Adapter:
         return self.model
 
     def detach(self) -> ReconstructionModel:
-        """Take the adapter out, if it is in place, and return the model as it was."""
+        """Take the adapter out, if it is attached, and return the model as it was."""
         if self.attached:
             self._remove_layers()
             self._install_token(self._base_token)

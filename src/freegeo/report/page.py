@@ -20,7 +20,7 @@ Range = tuple[float, float]
 CHANGE_LIMIT = 0.2
 """Relative depth change at the end of the colour scale."""
 MANY_VIEWS, NARROW_WIDTH = 16, 224
-"""With more views than this, pictures have this width in pixels."""
+"""With more than `MANY_VIEWS` views, pictures are at most `NARROW_WIDTH` pixels wide."""
 SCORE_LABELS = {
     "auc03": "AUC@3°", "auc05": "AUC@5°", "auc15": "AUC@15°", "auc30": "AUC@30°", "abs_rel": "depth error (abs-rel)",
     "f1_rel5": "F1 of points",
