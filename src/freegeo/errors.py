@@ -1,4 +1,4 @@
-"""The errors a user may meet: one sentence that says what, where and what to do."""
+"""The errors a user may see: one sentence that says what is wrong, where, and what to do."""
 
 
 class FreeGeoError(Exception):

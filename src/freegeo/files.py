@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and the ledger of what was written below a run's folder.
+"""Atomic writes of files, and the ledger of what was written below a run's folder.
 
 A ledger in an output folder lists what freegeo wrote there, so that replacing a result never touches a file that
 somebody put beside it. Only the standard library is used here.
@@ -51,14 +51,14 @@ def atomic_path(path: Path) -> Generator[Path]:
 def _flush(path: Path) -> None:
     with path.open("rb+") as file:
         os.fsync(file.fileno())
-    # Some writers create private files; a result is as readable as any other file of the user.
+    # Some writers create files that only the owner can read; results get the permissions of the user's umask.
     mask = os.umask(0)
     os.umask(mask)
     path.chmod(0o666 & ~mask)
 
 
 def _enter_in_ledger(path: Path) -> None:
-    """Note a file in the ledger of the run folder that it lies in, if it lies in one."""
+    """Add a file to the ledger of the run folder that it is in, if it is in one."""
     path = path.absolute()
     owner = next((folder for folder in path.parents if (folder / RUN_FILE).is_file()), None)
     if owner is not None and path.name not in OWN_FILES:
@@ -67,7 +67,7 @@ def _enter_in_ledger(path: Path) -> None:
 
 
 def as_json(value: Any) -> Any:
-    """Return a value as it comes back from a JSON file: tuples become lists, keys text."""
+    """Return a value as it would be read back from a JSON file: tuples become lists, keys text."""
     return json.loads(json.dumps(value))
 
 

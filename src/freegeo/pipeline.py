@@ -52,7 +52,7 @@ CPU = Compute()
 def predict(
     model: ReconstructionModel, batch: ImageBatch, *, reference: str | None = None, compute: Compute = CPU
 ) -> Reconstruction:
-    """Reconstruct prepared images with the model as it stands.
+    """Reconstruct prepared images with the model and the adapter that is on, if any.
 
     `reference` None is the first view when an adapter is on, as in adaptation, else the model's own rule. UserError
     when the images do not fit into memory together.
@@ -82,11 +82,11 @@ def reconstruct(
         model: from `freegeo.load_model`; it is moved to the device.
         photos: what `freegeo.load_photos` takes or returned.
         adapter: an adapter of this model, or the folder of a saved one; it is used for this call, and the model is left
-            as it was. None: the model as it stands, with the adapter that is in place on it, if there is one.
+            as it was. None: the model in its present state, with the adapter that is on, if there is one.
         reference: rule of the reference view; None: the first view with an adapter, as in adaptation, else the model's.
-        device: cpu, cuda, cuda:N or mps; None: the best at hand.
+        device: cpu, cuda, cuda:N or mps; None: the best available.
         precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
-        max_views: most photos that are used; a list that `freegeo.load_photos` returned is used as it is.
+        max_views: most photos that are used; a list that `freegeo.load_photos` returned is used whole.
 
     Raises:
         UserError: an argument that cannot be used, or views that do not fit into memory together.
@@ -125,7 +125,7 @@ def _loaded(model: ReconstructionModel, folder: str | Path) -> Generator[None]:
 
 
 def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
-    """Put a saved adapter on a model, on; `adapter.detach()` takes it out and `adapter.reattach()` puts it back.
+    """Attach a saved adapter to a model and switch it on; `adapter.detach()` and `adapter.reattach()` undo and redo it.
 
     UserError when the folder holds no adapter, when it was made for another model, or when the model carries one.
     """
@@ -156,7 +156,7 @@ def adapt(
     progress: bool = False,
     on_step: Callable[[Progress], None] = lambda progress: None,
 ) -> Adapted:
-    """Adapt a model to one scene's photos; the adapter stays in place (`result.adapter.detach()` takes it out).
+    """Adapt a model to one scene's photos; the adapter stays attached (`result.adapter.detach()` takes it out).
 
     Settings left at None are those of the recipe; they mean what the options of `freegeo adapt` mean.
 
@@ -164,20 +164,20 @@ def adapt(
         model: from `freegeo.load_model`, without an adapter; it is moved to the device.
         photos: at least 3; what `freegeo.load_photos` takes or returned.
         recipe: `scene`, `paper`, `released-da3`, `released-vggt`, or a recipe of your own.
-        dataset: whose published settings the last three of these names take.
+        dataset: with the last three of these names, the dataset whose published settings are used.
         steps: optimiser steps.
         epochs: passes over all view sets, instead of steps.
         lr: peak learning rate.
         rank: rank of the adapter.
-        hold: weight of keeping what the model says with all views as it is.
+        hold: weight of the distance between adapted and frozen features of all views.
         views: views the teacher sees.
         keep: positions among them that the student keeps, such as `(0, 2, 4, 6)`.
         sets: view sets per scene.
         loss: settings of the loss, such as `{"weight_kq": 0.0}`.
         seed: of everything random.
-        device: cpu, cuda, cuda:N or mps; None: the best at hand.
+        device: cpu, cuda, cuda:N or mps; None: the best available.
         precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
-        max_views: most photos that are used; a list that `freegeo.load_photos` returned is used as it is.
+        max_views: most photos that are used; a list that `freegeo.load_photos` returned is used whole.
         resume_in: folder for the state of an unfinished run: the same call continues it. `result.save` to that folder
             removes the state.
         progress: show a bar in a terminal or notebook, lines in a log file; without it nothing is printed.
@@ -221,7 +221,7 @@ def _require_model(model: object) -> None:
 def scene_images(
     name: str, photos: Sequence[PhotoLike], model: ReconstructionModel, recipe: Recipe, batch: ImageBatch
 ) -> SceneImages:
-    """Return photos as a scene to adapt to: `batch` as it is, or what a recipe that resizes by itself makes of them."""
+    """Return photos as a scene to adapt to: `batch`, or the photos themselves for a recipe with a size of its own."""
     if recipe.squash is None:
         return SceneImages.from_batch(name, batch)
     return SceneImages.from_photos(name, photos, model, recipe)
@@ -238,7 +238,7 @@ def require_enough_photos(photos: Sequence[PhotoLike]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Hooks:
-    """How a caller follows a run."""
+    """Callbacks of a run."""
 
     stage: Callable[[str], None] = lambda name: None
     step: Callable[[Progress], None] = lambda progress: None
@@ -246,7 +246,7 @@ class Hooks:
 
 @dataclass
 class Job:
-    """Everything that turns photos into an output folder; each part that is already there is kept."""
+    """The inputs and settings that turn photos into an output folder; parts that already exist are kept."""
 
     model: ReconstructionModel
     batch: ImageBatch
@@ -254,7 +254,7 @@ class Job:
     recipe: Recipe | None
     """None: reconstruct with the frozen model, or with `adapter`."""
     scene: SceneImages | None = None
-    """What is adapted to (`scene_images`); needed with a recipe."""
+    """The images to adapt to (`scene_images`); needed with a recipe."""
     adapter: Path | None = None
     """A saved adapter to reconstruct with, instead of training one."""
     seed: int = SEED
@@ -271,13 +271,13 @@ class Job:
     command: str | None = None
     """The command line, for reconstruction.json."""
     after: Callable[[Job], None] = lambda job: None
-    """Writes more before the folder counts as finished."""
+    """Called before the folder is marked as finished, to write more."""
     in_place: Adapter | None = None
     """The adapter that the final prediction was made with; it stays on the model."""
 
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
-        # Whether the views fit is asked before an adapter is trained for them.
+        # Checks that the views fit into memory before an adapter is trained for them.
         plan_reconstruction(self.model, len(self.batch), self.batch.image_hw, compute=self.compute)
         frozen = None
         if self.recipe is not None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 Update = Callable[..., None]
 LOSS_EVERY = 10
-"""Steps between two looks at the loss: reading it waits for the device."""
+"""Steps between two readings of the loss, each of which waits for the device."""
 
 
 @contextmanager
@@ -48,7 +48,7 @@ def progress_bar(title: str, total: int) -> Generator[Update]:
 
         def update(done: int, text: str | None = None) -> None:
             nonlocal known
-            if not known:  # a resumed run begins far from zero, which must not look like speed
+            if not known:  # the start of a resumed run must not count towards the speed
                 known = True
                 bar.reset(task, completed=done)
             bar.update(task, completed=done)
@@ -93,7 +93,7 @@ def _lines(title: str, total: int) -> Update:
 
     def update(done: int, text: str | None = None) -> None:
         nonlocal first, shown
-        # What comes before the first report, such as an adaptation or an earlier leg, says nothing about the speed.
+        # Time and work before the first report, such as an adaptation or an earlier run, do not count for the speed.
         first = first or (done, time.monotonic())
         tenth = done * 10 // total
         if tenth > shown:

@@ -25,7 +25,7 @@ _PART = re.compile(r"\..+\.[0-9a-f]{8}\.part(\..*)?")
 
 @contextmanager
 def locked(folder: Path) -> Generator[None]:
-    """Hold a folder against other processes; the lock goes with the process, however it ends.
+    """Lock a folder against other processes; the system releases the lock when the process ends.
 
     UserError when the folder cannot be made or written to, or when another process holds it.
     """
@@ -38,7 +38,7 @@ def locked(folder: Path) -> Generator[None]:
             f"{folder}: the output folder cannot be written to ({error.strerror}). Choose another one."
         ) from None
     with handle:
-        # A lock on a file that its last holder has just removed would protect nothing.
+        # The previous holder may have removed the file between open and lock; such a lock would protect nothing.
         if not _try_lock(handle) or not _is_same_file(handle, lock):
             raise UserError(f"{folder}: another freegeo process is writing here. Wait for it or choose another folder.")
         try:
@@ -95,10 +95,10 @@ class RunFolder:
 def run_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool = False) -> Generator[RunFolder]:
     """Open an output folder for a command with JSON-like settings.
 
-    Absent or empty: it is started. Unfinished with the same settings: it goes on. Finished with the same settings:
-    `finished` is true and the caller leaves it alone. Other settings, or a folder that freegeo did not write:
-    UserError, unless `overwrite`, which removes what earlier runs wrote (and nothing else; a foreign folder is refused
-    all the same). A block that is refused before it wrote anything leaves no trace.
+    Absent or empty: a run is started. Unfinished with the same settings: it continues. Finished with the same settings:
+    `finished` is true and the caller must not write. Other settings, or a folder that freegeo did not write: UserError.
+    `overwrite` removes what earlier runs wrote, and nothing else; a folder that freegeo did not write is still refused.
+    When the block raises UserError before it wrote a file, the settings file and a new folder are removed again.
     """
     settings = as_json(settings)
     check_folder(path, settings, overwrite=overwrite)
@@ -134,7 +134,7 @@ def _open(path: Path, settings: Mapping[str, Any], overwrite: bool) -> str | Non
 
 
 def check_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool) -> None:
-    """Raise UserError when `run_folder` would refuse; cheap, so that commands can ask before they load anything."""
+    """Raise UserError when `run_folder` would refuse; cheap, so that commands can check before they load anything."""
     settings = as_json(settings)
     if path.exists() and not path.is_dir():
         raise UserError(f"{path}: is a file. Choose a folder for the output.")
@@ -156,7 +156,7 @@ def check_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool) ->
 
 
 def stored_state(path: Path) -> dict[str, Any] | None:
-    """Return format, settings and finishing time of the run a folder holds; None when it holds none."""
+    """Return format, settings and finishing time of the run in a folder; None when there is none."""
     file = path / RUN_FILE
     if not file.is_file():
         return None
@@ -170,7 +170,7 @@ def clear(path: Path) -> None:
     """Remove what earlier runs wrote into a folder, and nothing that anybody else put there."""
     state = stored_state(path)
     if state is not None:
-        # Should the removal be cut short, what is left must not pass for a finished result.
+        # If the removal is interrupted, the remaining files must not count as a finished result.
         write_json(path / RUN_FILE, {**state, "finished": None})
     files = [path / name for name in _ledger(path)]
     for file in files:
@@ -187,7 +187,7 @@ def clear(path: Path) -> None:
 def difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Name the settings that differ, dotted where they are nested, with both values; empty when none does.
 
-    At most four are named, of more the number. Both are as they come from JSON (`freegeo.files.as_json`).
+    At most four are named, for the rest their number is given. Both are as read from JSON (`freegeo.files.as_json`).
     """
     parts = list(_differences(before, now))
     more = len(parts) - _SHOWN

@@ -18,7 +18,7 @@ _META_KEYS = ("image_hw", "grid_hw")
 
 
 class PhotoLike(Protocol):
-    """What models and scenes need of a photo; `freegeo.data.photos.Photo` is one."""
+    """The interface of a photo for models and scenes; `freegeo.data.photos.Photo` implements it."""
 
     @property
     def name(self) -> str:
@@ -37,7 +37,7 @@ class PhotoLike(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class ImageBatch:
-    """Photos at the size a model reads them, with the way back to the photos' own pixels.
+    """Photos at the size a model reads them, with the mapping to the photos' own pixels.
 
     A photo pixel `u` appears in the model image at `u * scale + offset` (per axis, x first); principal points
     move by the same rule (docs/conventions.md, "From model pixels to the photo").
@@ -75,7 +75,7 @@ class ImageBatch:
     def model_K(self, K: Tensor) -> Tensor:
         """Turn intrinsics (S, 3, 3) of the original photos into those of the model's images.
 
-        `freegeo.geometry.camera.photo_K` is the way back.
+        `freegeo.geometry.camera.photo_K` is the inverse.
         """
         rows = K[:, :2] * self.scale_xy.to(K)[:, :, None]
         rows[:, :, 2] += self.offset_xy.to(K)
@@ -84,7 +84,7 @@ class ImageBatch:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewTokens:
-    """What `embed` knows of each view by itself: the input of the first cross-view layer.
+    """The output of `embed`, computed for each view by itself: the input of the first cross-view layer.
 
     `tokens` is the residual stream; `extra` holds what later steps need of earlier layers, each (B, S, ...):
     the class token that reference selection compares (`selection`) and the outputs of layers below the first
@@ -105,7 +105,7 @@ class ViewTokens:
 
     @classmethod
     def join_views(cls, parts: Sequence[ViewTokens]) -> ViewTokens:
-        """Put the views of several parts behind each other; all parts have the same image size."""
+        """Concatenate the views of several parts; all parts have the same image size."""
         first = parts[0]
         if any(p.image_hw != first.image_hw for p in parts):
             raise ValueError(f"view tokens of different image sizes cannot be joined: {[p.image_hw for p in parts]}")
@@ -188,7 +188,7 @@ class Cameras:
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """A network's answer at the network's resolution; what a model does not predict, or was not asked for, is None."""
+    """A network's output at the network's resolution; what a model does not predict, or was not asked for, is None."""
 
     depth_z: Tensor | None = None
     """(..., S, H, W), up to scale unless the model is metric."""

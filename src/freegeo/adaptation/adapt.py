@@ -52,7 +52,7 @@ class Progress:
 
 @dataclass
 class Adapted:
-    """A trained adapter, still in place on its model, and how it came about."""
+    """A trained adapter, attached to its model, with the settings and the loss curve of its run."""
 
     adapter: Adapter
     recipe: Recipe
@@ -63,7 +63,7 @@ class Adapted:
     seconds: float = 0.0
 
     def __repr__(self) -> str:
-        """Return how long the run was and what came of it."""
+        """Return the recipe, the number of steps, the loss at start and end, and the duration."""
         change = self.loss_change()
         return (
             f"Adapted({self.recipe.name} recipe, {len(self.curve)} steps, loss {change['first']:.4g} -> "
@@ -71,7 +71,7 @@ class Adapted:
         )
 
     def metadata(self) -> dict[str, Any]:
-        """Return what freegeo.json says of the run."""
+        """Return the entries of freegeo.json that describe the run."""
         return {
             "recipe": asdict(self.recipe),
             "seed": self.seed,
@@ -119,7 +119,7 @@ def adapt(
     on_step: Callable[[Progress], None] = lambda progress: None,
     on_epoch: Callable[[int, Adapter], None] = lambda epoch, adapter: None,
 ) -> Adapted:
-    """Train an adapter on the scenes' images; it stays in place on the model, on.
+    """Train an adapter on the scenes' images; afterwards it is attached to the model and on.
 
     Args:
         model: moved to the device of `compute`; left without an adapter when anything fails.
@@ -127,15 +127,15 @@ def adapt(
         recipe: everything that decides the result, with `seed`.
         seed: of the adapter's start, the order of view sets, token draws and dropout.
         compute: device and precision.
-        plan: where samples wait and whether activations are computed twice; None: the fastest way that fits.
-        resume_in: folder for the state of an unfinished run: the same call continues it, and on the CPU ends with the
-            same tensors.
+        plan: where samples are kept and whether activations are recomputed; None: the fastest plan that fits.
+        resume_in: folder for the state of an unfinished run. The same call continues the run; on the CPU it ends with
+            the same tensors as a run without a stop.
         on_step: called after every step.
         on_epoch: called after every epoch with its number and the adapter.
 
     Raises:
         UserError: scenes that are too small, a state of another run, or a run that does not fit into memory.
-        FreeGeoError: a loss or gradient that is not finite, or memory that ran out all the same.
+        FreeGeoError: a loss or gradient that is not finite, or memory that runs out even with the smallest plan.
     """
     steps = schedule([scene.count for scene in scenes], recipe, seed)
     plan = plan or plan_adaptation(model, scenes, recipe, steps, compute=compute, folder=resume_in)
@@ -148,7 +148,7 @@ def adapt(
                 f"{compute.device} ran out of memory even with activation checkpointing and teacher features on disk. "
                 "Use smaller images, fewer --views, --precision bf16 or a smaller model."
             ) from None
-    # Here the tensors of the failed run are gone.
+    # Outside the except block the exception no longer keeps the tensors of the failed run alive.
     logger.warning(
         "%s ran out of memory: once more with activation checkpointing and teacher features on disk", compute.device
     )
@@ -161,7 +161,7 @@ def adapt(
 
 @dataclass(frozen=True)
 class _Run:
-    """What a caller asked for."""
+    """The arguments of `adapt`, with the visits of every step."""
 
     model: ReconstructionModel
     scenes: Sequence[SceneImages]
@@ -224,7 +224,7 @@ def _learn(
     loss, terms = adaptation_loss(student.levels, teacher, sample.held_out, draws, recipe.loss, form=sample.form)
     scaler.scale(loss * share).backward()
     if recipe.hold:
-        # Not in the paper: with all views the adapted features shall stay where the frozen ones are.
+        # Not in the paper: penalises the distance of the adapted features from the frozen ones, over all views.
         del tokens, teacher, student, loss
         with run.compute.autocast():
             adapted = loss_features(adapter.model, sample.tokens)
@@ -250,7 +250,7 @@ def _training(run: _Run, plan: Plan, step: int) -> Generator[None]:
 
 
 class _State:
-    """What changes from step to step: the adapter, its optimiser, the loss curve; saved and taken up again."""
+    """What changes from step to step and can be saved and restored: adapter, optimiser, gradient scaler, loss curve."""
 
     def __init__(self, run: _Run, result: Adapted):
         self.run, self.result = run, result
@@ -261,16 +261,17 @@ class _State:
         self.next_step = self._restore()
 
     def update(self, step: int, terms: dict[str, Tensor]) -> None:
-        """Clip the gradients and take an optimiser step, unless the loss or the gradient is seen not to be finite.
+        """Clip the gradients and take an optimiser step.
 
-        Reading a number from an accelerator would make it wait, so there it is read later, by `read_terms`.
+        On the CPU a loss or gradient that is not finite raises FreeGeoError before the step. On an accelerator the
+        check would wait for the device, so it is left to a later call of `read_terms`.
         """
         recipe = self.run.recipe
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(step, len(self.run.steps), recipe)
         self.scaler.unscale_(self.optimiser)
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, recipe.clip)
-        # The scaler meets gradients that overflow by leaving the step out and scaling less; that is no failure.
+        # When gradients overflow, the scaler skips the step and lowers its scale, so that is no failure.
         self.unread.append((step, terms if self.scaler.is_enabled() else {**terms, "gradient": norm.detach()}))
         if self.run.compute.device.type == "cpu":
             self.read_terms()
@@ -285,7 +286,7 @@ class _State:
         self.unread.clear()
 
     def save(self, next_step: int, *, seconds: float) -> None:
-        """Write a state that goes on with `next_step`; the file appears whole or not at all."""
+        """Write the state of a run that continues at `next_step`; the file is replaced atomically."""
         assert self.run.folder is not None
         self.read_terms()
         tensors = {}
@@ -303,7 +304,7 @@ class _State:
         write_tensors(self.run.folder / UNFINISHED_FILE, tensors, {"run": json.dumps(about)})
 
     def _restore(self) -> int:
-        """Take over a saved state, if there is one, and return the step to go on with."""
+        """Load the saved state, if there is one, and return the step to continue at."""
         path = None if self.run.folder is None else self.run.folder / UNFINISHED_FILE
         if path is None or not path.is_file():
             return 0
@@ -313,7 +314,7 @@ class _State:
         named = self.result.adapter.named_parameters()
         self.result.adapter.load({name: tensors[name] for name in named})
         for name, parameter in named.items():
-            # The optimiser computes on the parameter's device, its step counter included.
+            # The fused optimiser needs its state, the step counter included, on the parameter's device.
             self.optimiser.state[parameter] = {
                 key.partition("|")[2]: value.to(parameter.device)
                 for key, value in tensors.items()
@@ -324,7 +325,7 @@ class _State:
         return about["next_step"]
 
     def _identity(self) -> str:
-        """Return a fingerprint of everything but the pixels and weights that decides what the run computes."""
+        """Return a fingerprint of model name, scenes, recipe and seed; pixels and weights are left out."""
         about = {
             "model": self.run.model.spec.name,
             "scenes": [(scene.name, scene.count) for scene in self.run.scenes],

@@ -1,4 +1,4 @@
-"""LoRA on the cross-view layers together with the camera token: attach, switch off, scale, fold in, take out, put back.
+"""LoRA on the cross-view layers together with the camera token: attach, switch off, scale, merge, detach, reattach.
 
 peft owns the LoRA layers; the camera token is a parameter, not a module, so it is owned here and swapped into the model
 while the adapter is on. The base weights are never touched before `merge`.
@@ -38,8 +38,8 @@ def count_trainable(model: ReconstructionModel, rank: int) -> int:
 
 
 def is_adapted(model: nn.Module) -> bool:
-    """Whether an adapter is in place on a model, and on."""
-    # Only peft's layers have this attribute; asking for their class would load peft, which takes seconds.
+    """Whether a model has an adapter that is on."""
+    # Only peft's layers have this attribute; an isinstance check would import peft, which takes seconds.
     return any(not getattr(module, "disable_adapters", True) for module in model.modules())
 
 
@@ -67,7 +67,7 @@ class PackedDropout(nn.Module):
 
 
 class Adapter:
-    """An adapter in place on a model: on by default, with strength 1.
+    """An adapter attached to a model: on by default, with strength 1.
 
     A fresh one changes nothing: LoRA's B matrices are zero and the camera token is a copy.
     """
@@ -92,7 +92,7 @@ class Adapter:
 
     @property
     def attached(self) -> bool:
-        """Whether the adapter is in place on its model, on or off."""
+        """Whether the adapter's layers are in its model, on or off."""
         name, layer = next(iter(self.layers.items()))
         return self.model.get_submodule(name) is layer
 
@@ -138,7 +138,7 @@ class Adapter:
             r=rank, lora_alpha=alpha, lora_dropout=dropout, target_modules=list(wanted), bias="none",
             exclude_modules=_same_endings(modules, wanted) or None,
         )  # fmt: skip
-        # peft fills the new layers from the global generator, which is not ours to turn.
+        # peft initialises the new layers from the global generator, whose state must not change.
         with torch.random.fork_rng(devices=[]):
             inject_adapter_in_model(config, part, adapter_name=ADAPTER_NAME)
         layers = {name: cast(LoraLayer, part.get_submodule(name)) for name in wanted}
@@ -175,13 +175,13 @@ class Adapter:
 
     @contextmanager
     def off(self) -> Generator[None]:
-        """Run the frozen model inside the block: LoRA bypassed, original camera token, nothing forgotten after it."""
+        """Run the frozen model inside the block (LoRA bypassed, original camera token), then restore the state."""
         with self._switched(False):
             yield
 
     @contextmanager
     def applied(self) -> Generator[None]:
-        """Run the adapted model inside the block, also if the adapter is off or detached; afterwards all is as before.
+        """Run the adapted model inside the block, even if the adapter is off or detached, then restore the state.
 
         UserError as in `reattach`.
         """
@@ -219,7 +219,7 @@ class Adapter:
             self._install_token(self._token)
 
     def merge(self) -> ReconstructionModel:
-        """Fold the adapter (at its strength) into the weights and return the plain model; the adapter is used up."""
+        """Add the adapter (at its strength) to the weights and return the plain model; it cannot be used again."""
         self.reattach()
         for layer in self.layers.values():
             layer.merge(safe_merge=True)
@@ -229,14 +229,14 @@ class Adapter:
         return self.model
 
     def detach(self) -> ReconstructionModel:
-        """Take the adapter out, if it is in place, and return the model as it was."""
+        """Take the adapter out, if it is attached, and return the model as it was."""
         if self.attached:
             self._remove_layers()
             self._install_token(self._base_token)
         return self.model
 
     def reattach(self) -> None:
-        """Put the adapter back on its model after `detach`, on; nothing happens while it is in place.
+        """Put the adapter back on its model after `detach` and switch it on; no effect while it is attached.
 
         UserError when another adapter is in place, or when this one was merged.
         """
@@ -247,7 +247,7 @@ class Adapter:
         _require_none(self.model)
         for name, layer in self.layers.items():
             for matrix in _matrices(layer):
-                # The model may have been moved meanwhile.
+                # The model may have been moved to another device since `detach`.
                 matrix.data = matrix.data.to(cast(nn.Linear, layer.base_layer).weight.device)
             self._put(name, cast(nn.Module, layer))
         self.model.peft_config = self._peft_config
@@ -256,7 +256,7 @@ class Adapter:
     def _remove_layers(self) -> None:
         for name, layer in self.layers.items():
             self._put(name, layer.base_layer)
-        # peft notes its configuration on the model and would warn about a second adapter.
+        # peft stores its configuration on the model; left there, it would cause a warning about a second adapter.
         del self.model.peft_config
 
     def _put(self, name: str, module: nn.Module) -> None:
@@ -267,7 +267,7 @@ class Adapter:
         return [parameter.requires_grad for parameter in self.parameters()]
 
     def _switch(self, on: bool, flags: Sequence[bool] = ()) -> None:
-        """Turn an adapter that is in place on or off; `flags` say afterwards which parameters are trained."""
+        """Turn an attached adapter on or off, then set `requires_grad` of its parameters to `flags`."""
         for layer in self.layers.values():
             layer.enable_adapters(on)
         # peft clears and sets requires_grad when it switches adapters.
@@ -280,7 +280,7 @@ class Adapter:
             return
         owner, _, leaf = self.model.camera_token_name.rpartition(".")
         parameters = self.model.get_submodule(owner)._parameters
-        # A model that was moved meanwhile took along only the token that was in place.
+        # Moving the model moves only the token that is installed, so this one may be on another device.
         token.data = token.data.to(parameters[leaf])
         parameters[leaf] = token
 

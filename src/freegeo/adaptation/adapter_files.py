@@ -1,4 +1,4 @@
-"""Adapters on disk: peft's own two files, the camera token, and what the adapter is.
+"""Adapters on disk: peft's own two files, the camera token, and metadata.
 
 ADAPTER/  adapter_config.json         rank, alpha, target layers                                    peft's format
           adapter_model.safetensors   base_model.model.<layer>.lora_{A|B}.weight, float32           peft's format
@@ -58,7 +58,7 @@ def save_adapter(adapter: Adapter, folder: Path, metadata: Mapping[str, Any]) ->
 
 
 def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
-    """Attach a saved adapter, on and at strength 1, for inference; the model stays as it was when this fails.
+    """Attach a saved adapter, on and at strength 1, for inference; the model is unchanged when this fails.
 
     Reads our own folders, plain peft folders and the authors' published layout. UserError when the folder is no
     adapter, or when it was made for another model (by layer names and shapes; a differing fingerprint of the same
@@ -99,7 +99,7 @@ def adapter_metadata(folder: Path) -> dict[str, Any] | None:
 def _camera_token(model: ReconstructionModel, folder: Path) -> dict[str, Tensor]:
     if (folder / TOKEN).is_file():
         return read_tensors(folder / TOKEN)
-    # A plain peft adapter leaves the token alone; the authors' never does.
+    # A plain peft adapter has no camera token; the authors' always has one.
     if is_published(folder) and model.camera_token_name is not None:
         return {"camera_token": read_camera_token(folder)}
     return {}
@@ -147,7 +147,7 @@ def write_peft(adapter: Adapter, folder: Path, *, root: str = "") -> list[Path]:
 def read_peft(folder: Path) -> tuple[Mapping[str, Any], dict[str, Tensor]]:
     """Return an adapter's configuration and its tensors `<layer>.lora_{A|B}.weight`.
 
-    UserError when the folder holds no LoRA adapter, or one that computes something else than plain LoRA does.
+    UserError when the folder holds no LoRA adapter, or one with settings beyond plain LoRA.
     """
     if not (folder / CONFIG).is_file() or not (folder / WEIGHTS).is_file():
         raise UserError(
@@ -178,7 +178,7 @@ def _plain(value: Any) -> Any:
 
 
 def own_names(model: ReconstructionModel, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Name LoRA tensors by the layers of the whole model, where a file names them by those of the adapted part."""
+    """Return LoRA tensors by their names in the whole model, where a file names them relative to the adapted part."""
     root = model.published_adapter_root
     modules = {name for name, _ in model.named_modules()}
     if not root or any(f"{root}.{layer}" not in modules for layer in lora_layers(tensors)):
@@ -187,7 +187,7 @@ def own_names(model: ReconstructionModel, tensors: Mapping[str, Tensor]) -> dict
 
 
 def is_published(folder: Path) -> bool:
-    """Say whether a folder is the peft half of a published adapter, by its name."""
+    """Whether a folder is, by its name, the peft folder of a published adapter."""
     return folder.absolute().name.endswith(LORA_SUFFIX)
 
 

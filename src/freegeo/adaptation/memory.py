@@ -1,7 +1,7 @@
-"""How much memory a run needs, before it starts, and the fastest way to make it fit.
+"""Predict the memory of a run before it starts, and choose the fastest plan that fits.
 
-Samples are counted exactly. What a pass occupies is estimated from the shapes of the adapted linear layers
-(docs/method.md, "Memory of a step"); a plug-in with other blocks than ours gets the same estimate. Bytes throughout.
+The size of samples follows from their shapes. What a pass occupies is estimated from the shapes of the adapted linear
+layers (docs/method.md, "Memory of a step"), also for a plug-in whose blocks differ from ours. Bytes throughout.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Parts = tuple[tuple[str, int], ...]
 WIDE = 4
 """Bytes of a float32: the residual stream, norms, features, losses, trained parameters."""
 TRIPLET_ARRAYS = 13
-"""Arrays with one number per triplet that live together while the angle terms are computed."""
+"""Arrays with one number per triplet that exist at the same time while the angle terms are computed."""
 WIDEST_LEVELS = 4
 """Levels that the dense heads read."""
 
@@ -45,13 +45,13 @@ class Plan:
     """How a run uses memory; nothing here changes its result."""
 
     place: Place = "device"
-    """Where samples wait for their next visit."""
+    """Where samples are kept between visits."""
     checkpointing: bool = False
     """Whether the student's activations are computed again in the backward pass instead of kept."""
     parts: Parts = ()
-    """What is on the device at its fullest moment, by name."""
+    """What is on the device at the peak: name and bytes of each part."""
     kept_bytes: int = 0
-    """All samples together, wherever they wait."""
+    """Most bytes of samples kept at one time, wherever they are kept."""
 
     @property
     def peak_bytes(self) -> int:
@@ -75,10 +75,10 @@ def plan_adaptation(
     budget: int | None = None,
     folder: Path | None = None,
 ) -> Plan:
-    """Return the fastest plan that fits: everything in memory, samples on disk, then checkpointing as well.
+    """Return the first plan that fits: samples on the device or on disk, then both again with checkpointing.
 
     The first image of every scene is loaded for its size. `budget` (bytes) None: what is free now; `folder` is where
-    files of samples would lie. The model may be on the meta device. UserError when nothing fits.
+    files of samples would be written. The model may be on the meta device. UserError when nothing fits.
     """
     budget = available(compute.device) if budget is None else budget
     job = Footprint(model, scenes, recipe, steps, compute)
@@ -96,7 +96,7 @@ def plan_adaptation(
 
 
 class Footprint:
-    """What a run computes, as far as memory is concerned."""
+    """The numbers of a run that its memory depends on."""
 
     def __init__(
         self,
@@ -117,7 +117,7 @@ class Footprint:
         self.largest = max(self.visits, key=lambda view_set: len(view_set.frames) * self.tokens[view_set.scene])
 
     def plan(self, place: Place, checkpointing: bool) -> Plan:
-        """Predict what is on the device when it is fullest: in the teacher's pass, the student's or that of `hold`."""
+        """Predict what is on the device at the peak: in the teacher's pass, the student's or that of `hold`."""
         kept = self._kept_peak()
         sample = self._sample(self.largest)
         teacher, learning = self._teacher(sample), self._learning(checkpointing)
@@ -125,7 +125,7 @@ class Footprint:
         waiting = kept if place == "device" else sample
         if place == "device":
             resident.append(("tokens of shared images", self._shared_tokens()))
-        # While the teacher runs for the last time, the sample that it makes is still missing among those kept.
+        # `teacher` counts the sample that its pass makes, which is therefore not counted among those kept.
         if teacher - sample > sum(size for _, size in learning):
             parts = [*resident, ("teacher features", max(0, waiting - sample)), ("teacher's pass", teacher)]
         else:
@@ -151,7 +151,7 @@ class Footprint:
         return max(options, key=lambda parts: sum(size for _, size in parts))
 
     def _pass(self, tokens: int, losses: int, checkpointing: bool) -> list[tuple[str, int]]:
-        """Return what a pass over `tokens` tokens leaves for its backward pass, and what comes on top of that."""
+        """Return what a pass over `tokens` tokens keeps for its backward pass, and the peak on top of that."""
         shape, compute = self.shape, self.compute
         saved = shape.saved_per_token(compute, rank=self.recipe.rank, dropout=self.recipe.dropout > 0)
         left = tokens * shape.blocks * (WIDE * shape.width if checkpointing else saved)
@@ -162,7 +162,7 @@ class Footprint:
         return [("student's pass", left + inputs), max(("losses", losses), ("backward pass", backward), key=_size)]
 
     def _losses(self, tokens: int) -> int:
-        """Gradients of all features, four blocks of the intra sweep, and the arrays over triplets."""
+        """Bytes of the gradients of all features, four blocks of the intra sweep, and the arrays over triplets."""
         loss = self.recipe.loss
         per_view, others = self.tokens[self.largest.scene], len(self.largest.kept) - 1
         queries = min(loss.num_query, per_view) * (others if loss.queries == "per_view" else 1)
@@ -179,7 +179,7 @@ class Footprint:
         return sum(self.shape.token_bytes(self.tokens[key[0]]) for key, count in uses.items() if count > 1)
 
     def _kept_peak(self) -> int:
-        """Follow the samples through the run: one stays from its first visit to its last."""
+        """Most bytes of samples kept at one time: each is kept from its first visit to its last."""
         left = Counter(sample_key(view_set, self.recipe) for view_set in self.visits)
         kept: dict = {}
         size = peak = 0
@@ -208,7 +208,7 @@ class Footprint:
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
-    """The numbers of a model that memory depends on."""
+    """The sizes of a model that its memory depends on."""
 
     width: int
     blocks: int
@@ -233,26 +233,26 @@ class Shape:
         feed_forward = 3 * e * h if self.gated else e * h
         statistics = WIDE * (4 + 5 * heads)
         total = norm_inputs + lora_inputs + attention + feed_forward + statistics + 4 * rank * e
-        # A dropout mask is one byte per element in CUDA's fused dropout and in ours on the CPU, elsewhere a number.
+        # A dropout mask is one byte per element in CUDA's fused dropout and in ours on the CPU, elsewhere a float.
         return total + (3 * d + h) * ((WIDE if compute.device.type == "mps" else 1) if dropout else 0)
 
     def passing(self, compute: Compute, *, with_adapter: bool) -> int:
-        """Bytes per token that live while one block is computed and are gone afterwards, at the widest place."""
+        """Peak bytes per token of the temporary tensors of one block."""
         e, d, h = narrow(compute), self.width, self.hidden
         inner = 4 * h if self.gated else 2 * h
         low_rank = WIDE * (2 * h if self.gated else h) if with_adapter and compute.precision != "fp32" else 0
         return 3 * WIDE * d + e * (d + inner) + low_rank
 
     def features(self, tokens: int, layers: int) -> int:
-        """Feature tensors of some layers while `aggregate` makes them: the joined halves, and the normalised copy."""
+        """Bytes of the features of `layers` layers in `aggregate`: the joined halves, and the normalised copy."""
         return 2 * WIDE * layers * tokens * self.channels
 
     def half_copies(self, compute: Compute) -> int:
-        """Half copies of the adapted weights, which autocast makes for every pass."""
+        """Bytes of the half-precision copies of the adapted weights, which autocast makes for every pass."""
         return 0 if compute.precision == "fp32" else 2 * self.adapted_parameters
 
     def token_bytes(self, tokens: int) -> int:
-        """Tokens between `embed` and `aggregate`."""
+        """Bytes of the tokens that `embed` passes to `aggregate`."""
         return WIDE * tokens * self.width
 
 
@@ -261,7 +261,7 @@ def shape_of(model: ReconstructionModel) -> Shape:
     part = model.adaptable()
     linears = [_base(part.get_submodule(name)) for name in part.adapter_targets()]
     attention = [linear for linear in linears if linear.out_features == 3 * linear.in_features]
-    # A third-party model may have no joint qkv layer; its first layer then stands for its width.
+    # A third-party model may have no joint qkv layer; then the width is taken from its first layer.
     width = (attention or linears)[0].in_features
     contraction = [linear for linear in linears if linear.out_features == width and linear.in_features != width]
     expansion = [linear for linear in linears if linear.in_features == width and linear.out_features > width]
@@ -273,7 +273,7 @@ def shape_of(model: ReconstructionModel) -> Shape:
         gated=any(linear.out_features == 2 * hidden for linear in expansion),
         parameters=sum(p.numel() for name, p in model.named_parameters() if ".lora_" not in name),
         adapted_parameters=sum(linear.weight.numel() for linear in linears),
-        # Both families put the outputs of two blocks beside each other.
+        # Both families concatenate the outputs of two blocks.
         channels=2 * width,
         special=part.spec.special_tokens,
     )
@@ -296,8 +296,8 @@ def plan_reconstruction(
     """Return what is on the device while `views` images are reconstructed together, and how many views would fit.
 
     Images are embedded and dense maps decoded a few views at a time; tokens, features and results grow with the number
-    of views. `budget` (bytes) None: what is free now, and what the model occupies already. UserError when the views do
-    not fit; it says how many would. The model may be on the meta device.
+    of views. `budget` (bytes) None: what is free now, plus what the model already occupies. UserError when the views
+    do not fit; it says how many would. The model may be on the meta device.
     """
     shape, spec = shape_of(model), model.adaptable().spec
     resident = shape.parameters * WIDE
@@ -345,7 +345,7 @@ def plan_reconstruction(
 
 
 def available(device: torch.device) -> int:
-    """Bytes that a run may use on a device, with some room left for what no plan sees."""
+    """Bytes that a run may use on a device: what is free, less a reserve for what a plan does not count."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0] * 0.92)
     return int(_host_available() * 0.8)

@@ -25,7 +25,7 @@ PAPER_SEED = 42
 SEED = 43
 """Seed of everything else: adaptation to a user's own photos."""
 SMALLEST_SCENE = 3
-"""Views below which there is no held-out view to learn from."""
+"""Fewest views of a view set: two that the student sees and one held out."""
 
 Selection = Literal["mixed", "topk", "random"]
 
@@ -109,7 +109,7 @@ class LossConfig:
         return any((self.weight_pk, self.weight_pq, self.weight_kq))
 
     def changed(self, changes: Mapping[str, Any]) -> LossConfig:
-        """Return the settings with some replaced; UserError for a name that is none."""
+        """Return the settings with some replaced; UserError for an unknown name."""
         known = [field.name for field in fields(self)]
         for name in changes:
             if name not in known:
@@ -149,9 +149,9 @@ class Recipe:
     repeat_views: bool
     """Whether a scene with fewer than N frames repeats some; otherwise it uses what it has."""
     neighbours: bool
-    """Whether the views of a set are frames in a row, for models that know no others; else random ones."""
+    """Whether the views of a set are consecutive frames, for models trained on such views only; else random ones."""
     hold: float
-    """Weight of staying, with all N views, where the frozen model's features are; 0, as in the paper: no such term."""
+    """Weight of the distance between adapted and frozen features of all N views; 0, as in the paper: no such term."""
     augmentation: Literal["none", "released"]
     """`released`: mirror the set with p = .5, brighten each view with p = .5 by U(.8, 1.2), fixed by the set's seed."""
     squash: int | None
@@ -187,7 +187,7 @@ class Recipe:
 
         Setting steps unsets epochs and the reverse; setting the rank sets alpha to it, unless that is given too. `loss`
         names settings of the loss, such as `{"weight_kq": 0.0}`; the others of the loss stay. UserError for a loss
-        setting that does not exist, and for values that make no sense.
+        setting that does not exist, and for invalid values.
         """
         given = {name: value for name, value in changes.items() if value is not None}
         if loss:
@@ -211,7 +211,7 @@ class DatasetRow(NamedTuple):
 
 # What depends on the dataset: view sets per scene, distinct seeds, epochs, rate, final rate. The paper's rows are its
 # supplement's table of training settings (the main text says 5 epochs for all). The released rows are what the runners
-# come to, which is not all that they announce (docs/method.md, "Released recipes").
+# compute, which differs in places from what they announce (docs/method.md, "Released recipes").
 PAPER_DATASETS: Mapping[str, DatasetRow] = {
     "eth3d": DatasetRow(10, 10, 3, 1e-4, 1e-7),
     "7scenes": DatasetRow(20, 20, 3, 5e-5, 1e-8),
@@ -261,7 +261,7 @@ PAPER = Recipe(
         reference_view=0,  # open; as released
     ),
     views=8,
-    keep=None,  # (0, 2, 4, 6) of 8; said as "every second one", so that it also holds for scenes of fewer views
+    keep=None,  # (0, 2, 4, 6) of 8; as "every second one" it also applies to scenes of fewer views
     **PAPER_DATASETS["eth3d"]._asdict(),  # `paper` puts in the row of its dataset
     first_seed=40,  # open; as released
     steps=None,
@@ -328,7 +328,7 @@ def scene(spec: ModelSpec) -> Recipe:
 
 
 def paper(spec: ModelSpec, dataset: str | None) -> Recipe:
-    """Return the paper's settings of a dataset; a model without published settings keeps its own rate and rank."""
+    """Return the paper's settings of a dataset; a model without published settings keeps its own rank."""
     own = spec.adaptation
     row = _row(PAPER_DATASETS, dataset, PAPER.name, spec)
     return PAPER.changed(

@@ -40,10 +40,10 @@ from freegeo.models.precision import Compute
 from freegeo.types import Features, ImageBatch, PhotoLike, ViewTokens
 
 Place = Literal["device", "disk"]
-"""Where samples wait for their next visit: on the model's device, or in files that the system maps into memory."""
+"""Where samples are kept between visits: on the model's device, or in memory-mapped files."""
 DRAW_SEED_STRIDE = 1_000_003
 SPREAD_HEADROOM = 2.0
-"""How far the student's softmax inputs may spread beyond the teacher's, where they are measured once per view set."""
+"""Factor by which the student's spread of softmax inputs may exceed the teacher's, measured once per view set."""
 AHEAD = 2
 """View sets whose images are decoded in the background before they are needed."""
 
@@ -68,7 +68,7 @@ class SceneImages:
     def from_photos(
         cls, name: str, photos: Sequence[PhotoLike], model: ReconstructionModel, recipe: Recipe
     ) -> SceneImages:
-        """Decode photos on demand, as the model reads them or squashed as the recipe asks.
+        """Decode photos on demand, preprocessed for the model or squashed as the recipe says.
 
         UserError when the recipe's square is no whole number of the model's patches.
         """
@@ -111,7 +111,7 @@ class Sample:
     """Everything a visit reads of its view set; tensors have a batch of 1 and no gradient."""
 
     tokens: ViewTokens
-    """The views that pass through the student: the kept ones, or all N where the recipe holds them."""
+    """The embedded views: the kept ones, or all N where the recipe has the `hold` term."""
     teacher: Features
     """The teacher's features of the same views at the loss layers."""
     held_out: Tensor
@@ -245,7 +245,7 @@ class Samples:
                 yield tokens
 
     def _in_file(self, sample: Sample) -> Sample:
-        """Move a sample to a file; its tensors are read from there, by the system, when they are used."""
+        """Write a sample to a file and return it with memory-mapped tensors, which are read when they are used."""
         from safetensors import safe_open
         from safetensors.torch import save_file
 
@@ -287,7 +287,7 @@ def loss_features(model: ReconstructionModel, tokens: ViewTokens) -> Features:
 
 
 def step_draws(sample: Sample, visit: Visit, config: LossConfig, *, seed: int) -> StepDraws:
-    """Draw the tokens of a visit: a function of seed and step alone."""
+    """Draw the tokens of a visit; the random numbers depend on seed and step alone."""
     patch, special = sample.teacher.levels[max(sample.teacher.levels)]
     return draw_tokens(
         config,
@@ -316,7 +316,7 @@ def loaded_ahead(scenes: Sequence[SceneImages], requests: Iterable[tuple[int, Se
 
 
 def _empty_folder(parent: Path | None) -> Path:
-    """Return a folder for the files of one run at a time; what a killed run left there is removed."""
+    """Return an empty folder for the files of a run; files that a killed run left in it are removed."""
     if parent is None:
         return Path(tempfile.mkdtemp(prefix="freegeo-samples-"))
     folder = parent / "freegeo-samples"

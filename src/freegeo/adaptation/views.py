@@ -50,7 +50,7 @@ def draw_frames(count: int, views: int, seed: int, *, repeat: bool, neighbours: 
 
 
 def kept_positions(views: int, keep: tuple[int, ...] | None) -> tuple[int, ...]:
-    """Return the student's positions among `views`: `keep` where it fits and holds a view out, else every second."""
+    """Return the student's positions among `views`: `keep` if it fits and leaves a view out, else every second."""
     fits = keep is not None and keep[-1] < views and len(keep) < views
     return keep if fits else tuple(range(0, views, 2))
 

@@ -59,13 +59,13 @@ class AdapterJob:
 
     @property
     def digest(self) -> str:
-        """Short name of the configuration; the recipe's own name does not count."""
+        """Hash of the configuration without the recipe's name, so that equal recipes share an adapter."""
         about = self.configuration()
         about["recipe"].pop("name")
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
 
     def folder(self, out: Path) -> Path:
-        """Where the adapter lies."""
+        """Folder of the adapter in the benchmark folder `out`."""
         return Path(out) / FOLDER / self.dataset / self.digest
 
     def is_finished(self, out: Path) -> bool:
@@ -112,7 +112,7 @@ def train(
 
 
 def use(job: AdapterJob, model: ReconstructionModel, out: Path, epoch: int | None) -> Adapter:
-    """Put a trained adapter on the model, of one epoch or the last.
+    """Attach a trained adapter to the model: that of `epoch`, or the last one for None.
 
     FreeGeoError when it has not been trained; UserError when there was no such epoch.
     """
@@ -135,7 +135,7 @@ def trained_epochs(job: AdapterJob, out: Path) -> list[int]:
 
 
 def reset_peak_memory(device: torch.device) -> None:
-    """Start to measure the device's peak memory anew; that of the process on a CPU cannot be reset."""
+    """Reset the peak memory of a CUDA device; elsewhere nothing happens, as that of a process cannot be reset."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
 

@@ -70,7 +70,7 @@ def check_dataset(data: Path, name: str) -> Finding:
 
 
 def how_to_get(data: Path, dataset: Dataset) -> str:
-    """Commands that fetch and unpack a dataset; for one that is not on the hub, where its scenes are looked for."""
+    """Commands that fetch and unpack a dataset; for one that is not on the hub, the folder to put its scenes into."""
     if dataset.archive_gb is None:
         return f"put its scenes into {data / dataset.name}"
     return (

@@ -61,7 +61,7 @@ def _local(setup: Setup) -> Setup:
 
 
 class _Key:
-    """A setup that can be looked up by its content."""
+    """A setup that hashes and compares by its content, as the cache of `_worker` needs it."""
 
     def __init__(self, setup: Setup):
         self.setup = setup

@@ -1,4 +1,4 @@
-"""What a run will cost, said before it starts."""
+"""Estimates of a run's duration, made before it starts."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Cost:
         return forward + self.steps * self.seconds_of_step
 
     def lines(self) -> list[str]:
-        """Say it to a person."""
+        """The estimate as lines of text."""
         said = [
             f"{count} forward passes of {views} views, {self.seconds_of_pass[views]:.2f} s each"
             for views, count in sorted(self.passes.items())
@@ -59,7 +59,7 @@ class Cost:
 
 def estimate(predictor: Predictor, tasks: Sequence[Task]) -> Cost:
     """Count the work of unfinished tasks and measure one pass of each size and one step, on images of noise."""
-    predictor.forward(predictor.noise(2))  # what is loaded and allocated once shall not count
+    predictor.forward(predictor.noise(2))  # warm-up: keeps loading and first allocations out of the measurement
     passes = Counter(SAMPLE if variant(task.variant).encode_all else task.views for task in tasks)
     seconds = {views: _seconds_of_pass(predictor, views) for views in passes}
     jobs = [job for job in predictor.adapter_jobs(tasks) if not job.is_finished(predictor.setup.out)]
@@ -92,7 +92,7 @@ class ScoringCost:
         return self.frames * self.seconds_of_frame + self.surfaces * self.seconds_of_surface
 
     def line(self) -> str:
-        """Say it to a person."""
+        """The estimate as one line of text."""
         return (
             f"{self.dataset}: {self.surfaces} surfaces of {self.frames} frames to score, {self.seconds_of_frame:.2f} s "
             f"a frame and {self.seconds_of_surface:.1f} s a surface: about {self.seconds / 60:.1f} minutes"
@@ -102,7 +102,7 @@ class ScoringCost:
 def estimate_scoring(data: Path, tasks: Sequence[Task], *, device: torch.device | str = "cpu") -> list[ScoringCost]:
     """Measure fusion and scoring of a slanted wall at each dataset's sizes; a real scene has more surface than that.
 
-    A dataset whose first scene cannot be read is left out: the run itself will say why.
+    A dataset whose first scene cannot be read is left out; the run itself reports the reason.
     """
     costs = []
     for dataset in dict.fromkeys(task.dataset for task in tasks):
@@ -147,7 +147,7 @@ def _seconds_of_pass(predictor: Predictor, views: int) -> float:
 
 
 def _seconds_of_step(predictor: Predictor, scene: SceneImages, recipe: Recipe) -> float:
-    """Mean duration of the steps after the first, which also pays for what is done once."""
+    """Mean duration of the steps after the first, which also includes one-time work."""
     times: list[float] = []
     result = adapt(
         predictor.model, [scene], recipe, seed=predictor.setup.adapt_seed, compute=predictor.compute,

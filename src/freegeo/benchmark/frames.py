@@ -1,4 +1,4 @@
-"""What is fused: a stored prediction turned into metric depth maps with cameras, frame by frame."""
+"""The input of the fusion: a stored prediction turned into metric depth maps with cameras, frame by frame."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -89,7 +89,7 @@ def _resized(depth: Tensor, camera_hw: tuple[int, int], size_hw: tuple[int, int]
 
 
 def _masked(depth: Tensor, mask: np.ndarray | None) -> Tensor:
-    """Cut out what must not be fused. With a mask, NaN and infinity become NaN: a product, as published."""
+    """Set depth that must not be fused to 0; with a mask by a product, as published: NaN and infinity become NaN."""
     if mask is None:
         return torch.where(depth.isfinite() & (depth > 0), depth, 0.0)
     if tuple(mask.shape) != tuple(depth.shape):

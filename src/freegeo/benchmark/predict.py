@@ -1,4 +1,4 @@
-"""First stage: run the model on the frames of every task and store what it says, with the full configuration."""
+"""First stage: run the model on the frames of every task and store its predictions with the full configuration."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
 
 AdaptPer = Literal["dataset", "scene"]
 DEFAULT_ROW = "procedural"
-"""Settings of adaptation of a dataset for which none were published."""
+"""Row of adaptation settings for a dataset without published ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,12 +162,12 @@ class Predictor:
 
     @torch.no_grad()
     def forward(self, images: Tensor) -> Prediction:
-        """One whole pass over images (S, 3, H, W) with the model as it stands."""
+        """One whole pass over images (S, 3, H, W), with the adapter that is attached, if any."""
         with self.compute.autocast():
             return self.model.decode(self._features(self._embedded(images)))
 
     def close(self) -> None:
-        """Leave the model as it was loaded."""
+        """Detach the adapter, if there is one."""
         self._take_off()
 
     @torch.no_grad()
@@ -201,7 +201,7 @@ class Predictor:
         return [sample[position] for position in kept], values
 
     def _read(self, scene: Scene, frames: Sequence[int]) -> tuple[ViewTokens, Cameras | None]:
-        """The embedded frames, and their true cameras as the model takes them when the run gives them away."""
+        """The embedded frames and, where the run gives the model the true cameras, these in the model's convention."""
         chosen = scene.select(frames)
         batch = self.model.preprocess(list(chosen.photos))
         tokens = self._embedded(batch.images)
@@ -229,7 +229,7 @@ class Predictor:
         }
 
     def _put_on(self, job: AdapterJob | None) -> None:
-        """Have exactly the adapter of a job on the model."""
+        """Attach the adapter of a job in place of any other; None: leave the model without one."""
         wanted = None if job is None else str(job.folder(self.setup.out))
         if self._in_place is not None and self._in_place[0] == wanted:
             return
@@ -268,14 +268,14 @@ def predict_all(
 
 
 def adaptation_problem(job: AdapterJob, error: BaseException) -> Problem:
-    """How a failed adaptation becomes a problem."""
+    """The problem that reports a failed adaptation."""
     return Problem(
         dataset=job.dataset, scene=_joined(job.scenes), stage="adapt", what=job.digest, reason=reason_of(error)
     )
 
 
 def problem_of(stage: Literal["predict", "evaluate"]) -> Callable[[Task, BaseException], Problem]:
-    """How a failed task of a stage becomes a problem."""
+    """A function that turns a failed task of a stage into the problem that reports it."""
 
     def explain(task: Task, error: BaseException) -> Problem:
         what = f"{task.views} views, seed {task.seed}, {task.variant}"

@@ -29,9 +29,9 @@ class Row:
     scene: str
     rule: FrameRule
     views: int
-    """Views that were asked for."""
+    """Views of the task."""
     frames: int
-    """Views that there were."""
+    """Views that were used, fewer than `views` where the scene has fewer frames."""
     seed: int
     variant: str
     metric: str

@@ -24,7 +24,7 @@ def standard_frames(num_frames: int, budget: int, seed: int) -> list[int]:
 
     Args:
         num_frames: frames of the scene, at least 0.
-        budget: frames wanted; 0 or less asks for all.
+        budget: number of frames to choose; 0 or less chooses all.
         seed: any integer.
 
     Source: docs/benchmark.md, "Frame rules".

@@ -1,7 +1,7 @@
 """Scoring one prediction against the ground truth of its scene.
 
 One scene at a time: `score_scene_poses` and `score_scene_surface`; `SceneReference` holds the prepared ground truth,
-which depends on no model, view count or frame seed and is worth keeping.
+which depends on no model, view count or frame seed, so it can be reused.
 """
 
 import hashlib

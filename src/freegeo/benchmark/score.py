@@ -1,4 +1,4 @@
-"""Second stage: score stored predictions; the model is not needed any more.
+"""Second stage: score stored predictions, without the model.
 
 Metrics: `auc03` to `auc30`; of the fused surface `acc`, `comp`, `overall`, `precision`, `recall`, `fscore`; where the
 depth of frames is known `abs_rel`, `delta1`, for generated rooms also `f1_rel5`; `mse` and `cosine` of features;
@@ -54,7 +54,7 @@ _SAME_IN_VARIANT = ("per", "epoch", "recipe", "seed", "scenes")
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What came out of a folder."""
+    """The outcome of scoring a folder: rows of the tidy table, problems, and the files written."""
 
     rows: list[Row]
     problems: list[Problem]
@@ -71,7 +71,7 @@ def evaluate_all(
 ) -> Evaluation:
     """Score the stored predictions of a folder (of `wanted` tasks, or all) and write the tidy table of all of them.
 
-    Scores that are there are kept. A wanted task without a prediction is a problem of its scene.
+    Existing scores are kept. A wanted task without a prediction is reported as a problem.
 
     Raises:
         UserError: nothing is stored, or the predictions were made with different settings; the settings are named.
@@ -107,7 +107,7 @@ def require_same_settings(stored: Mapping[Task, Mapping[str, Any]]) -> None:
         _require_equal(first, (task, common))
         adaptation = configuration["adaptation"]
         if adaptation is not None:
-            # A scene-wise adapter knows its own scene only.
+            # A scene-wise adapter is trained on its own scene only, so the scenes differ.
             names = [name for name in _SAME_IN_VARIANT if name != "scenes" or adaptation["per"] == "dataset"]
             chosen = {f"adaptation.{name}": adaptation[name] for name in names}
             known = of_variant.setdefault((task.dataset, task.variant), (task, chosen))
@@ -124,7 +124,7 @@ def _require_equal(one: tuple[Task, Mapping[str, Any]], other: tuple[Task, Mappi
 
 
 class _Ground:
-    """A scene with its ground truth, read when it is needed and once."""
+    """A scene with its ground truth, each read once, on first use."""
 
     def __init__(self, data: Path, dataset: str, name: str, cache: Path):
         self.data, self.dataset, self.name, self.cache = data, dataset, name, cache
@@ -132,7 +132,7 @@ class _Ground:
         self._reference: SceneReference | None = None
 
     def scene(self) -> Scene:
-        """The scene."""
+        """The scene with all its frames."""
         self._scene = self._scene or load_scene(self.data, self.dataset, self.name)
         return self._scene
 
@@ -166,7 +166,7 @@ def _scored(
 def _metrics(
     chosen: Scene, stored: Stored, ground: _Ground, device: str | torch.device, *, posed: bool
 ) -> tuple[dict[str, float], dict[str, str]]:
-    """Metrics that exist, and why the others do not."""
+    """The metrics that could be computed, and the reasons why others could not."""
     metrics: dict[str, float] = {}
     failed: dict[str, str] = {}
 

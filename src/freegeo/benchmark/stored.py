@@ -30,7 +30,7 @@ class Stored:
 
 
 def write_stored(task: Task, out: Path, prediction: Prediction, frames: Sequence[int]) -> None:
-    """Store a prediction; UserError when the model does not predict what is scored."""
+    """Store a prediction; UserError when the model does not predict depth, poses or intrinsics."""
     found = {name: getattr(prediction, name) for name in ARRAYS}
     missing = [name for name, value in found.items() if value is None]
     if missing:

@@ -58,12 +58,12 @@ class Task:
     variant: str
 
     def folder(self, out: Path) -> Path:
-        """Where everything about the task lies."""
+        """Folder of the task's files in the benchmark folder `out`."""
         sample = f"{self.rule}-{self.views}v-seed{self.seed}"
         return Path(out) / PREDICTIONS / self.dataset / self.scene.replace("/", "-") / sample / self.variant
 
     def __str__(self) -> str:
-        """Name the task for people."""
+        """Dataset, scene, views, seed and variant as text."""
         return f"{self.dataset} {self.scene}, {self.views} views, seed {self.seed}, {self.variant}"
 
 
@@ -78,7 +78,7 @@ class Problem:
     reason: str
 
     def __str__(self) -> str:
-        """Name scene and reason in one sentence."""
+        """Scene, stage and reason as text."""
         return f"{self.dataset} {self.scene}: {self.stage} of {self.what}: {self.reason}"
 
 
@@ -87,8 +87,8 @@ def choose_frames(rule: FrameRule, num_frames: int, views: int, seed: int) -> li
 
     `da3`: the first entries of a seeded shuffle; sets of one seed are nested. `vggt`: the same, but fewer than 8 views
     are every second frame of the 8. `experiment`: the sample of the published "8->4" comparison, fewer than 8 views
-    likewise. `neighbours` (ours): 8 frames in a row from a seeded start,
-    fewer than 8 are every second of them; more than 8 are a longer row.
+    likewise. `neighbours` (ours): 8 consecutive frames from a seeded start; fewer than 8 views are every second of
+    them, more than 8 a longer run of frames.
 
     Source: docs/benchmark.md, "Frame rules".
     """
@@ -117,7 +117,7 @@ def family_rule(own: AdaptationDefaults) -> FrameRule:
 
 
 def is_finished(task: Task, out: Path, configuration: Mapping[str, Any], *, overwrite: bool = False) -> bool:
-    """Whether the task's prediction is there, made with this configuration.
+    """Whether the task's prediction exists and was made with this configuration.
 
     UserError names the setting when it was made with another one, unless `overwrite` allows to replace it.
     """

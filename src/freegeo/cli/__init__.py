@@ -1,1 +1,1 @@
-"""The command line: one file per command; the only room that prints."""
+"""The command line: one module per command. No other package prints to stdout."""

@@ -208,7 +208,7 @@ def run(
 
     predictor, tasks = _prepare(experiments, bench, model, recipe, options)
     problems = _predict(predictor, tasks, bench, cluster=options.cluster)
-    # What could not be predicted is known already; it shall not be reported twice.
+    # Failed predictions are reported already, so only stored tasks are evaluated.
     stored = {task for task, _ in stored_tasks(bench.output)}
     wanted = [task for task in tasks if task in stored]
     if not wanted:

@@ -24,14 +24,14 @@ def configure_logging(verbose: bool) -> None:
     logger.propagate = False
     warnings.showwarning = _show_warning  # ty: ignore[invalid-assignment]
     if not verbose:
-        # Pillow warns of odd metadata in files that it reads all the same.
+        # Pillow warns of odd metadata in files that it can read nevertheless.
         warnings.filterwarnings("ignore", category=UserWarning, module="PIL")
 
 
 def _show_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, file=None, line: str | None = None
 ) -> None:
-    """Stand in for Python's own, which shows a line of source code to people who asked for none."""
+    """Replace Python's own function, which also prints a line of source code."""
     note(f"warning: {message}")
 
 
@@ -51,7 +51,7 @@ def say(text: str = "") -> None:
 
 
 def note(text: str) -> None:
-    """Print a line about what is going on, to stderr."""
+    """Print a line about the progress of a command to stderr."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -87,7 +87,7 @@ def _wrapped(row: list[str], room: int) -> list[list[str]]:
 
 
 def written(folder: Path, files: Mapping[str, str]) -> None:
-    """List the files of a result that are there, with what each is for."""
+    """List the files of a result that exist, each with its purpose."""
     rows = []
     for name, about in files.items():
         path = folder / name
@@ -100,7 +100,7 @@ def written(folder: Path, files: Mapping[str, str]) -> None:
 
 
 def size(path: Path) -> str:
-    """Return the size of a file or folder for people."""
+    """Return the size of a file or folder as text."""
     total = sum(p.stat().st_size for p in path.rglob("*") if p.is_file()) if path.is_dir() else path.stat().st_size
     for unit in ("B", "kB", "MB"):
         if total < 1000:

@@ -89,7 +89,7 @@ def score_windows(job: Job, scene: Scene) -> dict[str, Any]:
 
 
 def mean_score(job: Job, scene: Scene, views: int) -> dict[str, float]:
-    """Score the model as it stands."""
+    """Score the model with the adapter that is on, if any."""
     from freegeo.metrics.scene import evaluate
     from freegeo.pipeline import predict
 
@@ -107,7 +107,7 @@ def windows(count: int, views: int) -> list[list[int]]:
 
 
 def report(scores: dict[str, Any], domain: str) -> None:
-    """Print the table and what it says."""
+    """Print the table of scores and a sentence on what adaptation changed."""
     from freegeo.metrics.scene import PRINTED
 
     header = ("views", "model", *(name.replace("auc0", "auc") for name in PRINTED))

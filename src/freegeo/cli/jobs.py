@@ -1,4 +1,4 @@
-"""What `run`, `reconstruct` and `demo` share: prepare photos, run a job with progress, say what came out."""
+"""What `run`, `reconstruct` and `demo` share: prepare photos, run a job with progress, print the outcome."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def run_job(
     extra_settings: dict[str, Any] | None = None,
     after: Callable[[Job], None] = lambda job: None,
 ) -> None:
-    """Carry out a job in its output folder and say what came out; a finished folder is left alone.
+    """Run a job in its output folder and print the outcome; a finished folder is not changed.
 
     `after` writes more before the folder counts as finished.
     """
@@ -106,7 +106,7 @@ def save_frames(photos: Sequence[PhotoLike], folder: Path) -> None:
 
 
 def adapter_identity(folder: Path) -> dict[str, str]:
-    """Return what tells an adapter from another one; UserError when the folder holds none."""
+    """Return what identifies an adapter; UserError when the folder holds none."""
     from freegeo.adaptation.adapter_files import WEIGHTS, read_peft
     from freegeo.models.checkpoints import fingerprint
 

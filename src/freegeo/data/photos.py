@@ -32,7 +32,7 @@ HEIF_SUFFIXES = frozenset({".heic", ".heif"})
 MAX_PIXELS = 150_000_000
 """Largest photo that is read; beyond it a decoded photo takes more than half a gigabyte."""
 MAX_VIEWS = 32
-"""Photos that are used of a source of more."""
+"""Default limit of the photos that are used of a source."""
 _SYSTEM_FILES = frozenset({"thumbs.db", "desktop.ini"})
 _ORIENTATION_TAG, _SIDEWAYS = 0x0112, (5, 6, 7, 8)
 
@@ -85,13 +85,13 @@ def load_photos(source: PhotoSource, max_views: int = MAX_VIEWS, *, fps: float |
         source: a folder, a pattern such as `photos/*.jpg` (both in natural name order), a video, a photo, or a list of
             photo files, PIL images and arrays (H, W, 3) uint8. `~` stands for the home folder. Images in memory are
             named after their place in the list: `image-000`, `image-001`, ... A list that this function returned is
-            returned as it is.
+            used whole, whatever `max_views` is.
         max_views: most photos to keep; frames of a video are chosen by sharpness and parallax instead of evenly.
         fps: videos only: take a frame this often per second.
 
     Raises:
-        UserError: says which file is missing, unreadable, no photo, or larger than `MAX_PIXELS`, and which image is not
-            of the kind above.
+        UserError: a file is missing, unreadable, no photo, or larger than `MAX_PIXELS`, or an image in memory is not
+            of the kind above; the message names it.
     """
     if max_views < 1:
         raise UserError(f"--max-views must be at least 1, got {max_views}.")
@@ -195,7 +195,7 @@ def natural_key(path: Path) -> list[tuple[int, int | str]]:
 
 
 def unique_names(paths: Sequence[Path]) -> list[str]:
-    """Return file names, with as many parent folders as it takes to tell all of them apart."""
+    """Return file names, with as many parent folders as needed to make them unique."""
     for depth in range(1, max((len(p.parts) for p in paths), default=1) + 1):
         names = ["/".join(path.parts[-depth:]) for path in paths]
         if len(set(names)) == len(names):
@@ -267,7 +267,7 @@ def _opened(path: Path) -> Generator:
         _register_heif(path)
     try:
         with warnings.catch_warnings():
-            # Pillow warns, and at twice the size refuses, by a limit of its own; ours decides.
+            # Pillow warns at a limit of its own, and refuses at twice that; only `MAX_PIXELS` applies here.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             image = Image.open(path)
         with image:
@@ -281,7 +281,7 @@ def _opened(path: Path) -> Generator:
     except Image.DecompressionBombError:
         raise _too_large(path, "its pixels are") from None
     except (OSError, SyntaxError, EOFError, ValueError, RuntimeError) as error:
-        # Every decoder of Pillow and of its plug-ins reports damage in a way of its own.
+        # The decoders of Pillow and of its plug-ins raise different errors for damaged files.
         reason = " ".join(str(error).split())
         raise UserError(f"{path}: the image is damaged or truncated ({reason}). Replace it or take it out.") from None
 

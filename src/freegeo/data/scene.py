@@ -15,7 +15,7 @@ from freegeo.types import PhotoLike
 
 @dataclass(frozen=True, kw_only=True)
 class SceneTruth:
-    """Where the ground truth of a scene lies; tuples have one entry per frame, None where a frame has no such file."""
+    """Ground-truth files of a scene; tuples have one entry per frame, None where a frame has no such file."""
 
     dataset: str
     """Name of the dataset whose constants and readers apply."""
@@ -47,7 +47,7 @@ class Scene:
     K: Tensor | None = None
     """(S, 3, 3) float32, pixels of the photos."""
     depth_z: Tensor | None = None
-    """(S, H, W) float32 metres, for scenes whose ground-truth depth lies in memory."""
+    """(S, H, W) float32 metres, for scenes whose ground-truth depth is in memory."""
     truth: SceneTruth | None = None
     """Ground-truth files of a benchmark scene."""
 

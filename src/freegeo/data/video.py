@@ -1,8 +1,8 @@
 """A user's video as photos: frames that are sharp and far enough apart, upright, decoded again when they are read.
 
-Two passes over the file. The first looks at every frame in small and keeps one candidate per time slot, at most
-`MAX_CANDIDATES` of them however long the video is. The choice is made among the candidates. The pixels of a chosen
-frame are decoded when they are asked for, so memory does not grow with length or resolution.
+The file is decoded twice. The first pass looks at reduced frames and keeps one candidate per time slot, at most
+`MAX_CANDIDATES` of them however long the video is. Frames are chosen among the candidates, and their pixels are decoded
+when they are read, so memory does not grow with length or resolution.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class VideoFrame:
             container.seek(self.pts, stream=stream)
         for number, frame in enumerate(_decoded(container, self.path)):
             if seek and frame.pts is not None and frame.pts >= self.pts:
-                # An index that leads past the frame is answered by decoding from the start.
+                # Where a wrong index seeks past the frame, None makes the caller decode from the start.
                 return frame if frame.pts == self.pts else None
             if not seek and number == self.number:
                 return frame
@@ -70,7 +70,7 @@ class VideoFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """What the choice of frames knows of one frame."""
+    """The data of one frame that the choice of frames is based on."""
 
     number: int
     pts: int | None
@@ -93,8 +93,8 @@ def load_video(path: Path | str, *, fps: float | None = None, max_views: int) ->
     Args:
         path: of a file that FFmpeg reads.
         fps: frames per second of the video's own clock: the sharpest frame of each interval, evenly thinned to
-            `max_views`. None chooses by parallax: steps of about the same image change, so a camera that rests gives
-            one frame, and the sharpest frame around each step.
+            `max_views`. None chooses by parallax: at steps of about the same image change the sharpest frame near each
+            step, so a camera that rests gives one frame.
         max_views: most frames to return.
 
     Returns:
@@ -148,7 +148,7 @@ def collect_candidates(path: Path, *, slot_s: float) -> list[Candidate]:
 
 
 def _keep_sharper(best: dict[int, Candidate], candidate: Candidate, slot_s: float) -> None:
-    # Timestamps carry the rounding of their time base, which must not tip a frame into the slot before its own.
+    # The small offset keeps the rounding of timestamps from moving a frame into the slot before its own.
     slot = int(candidate.time_s / slot_s + 1e-3)
     if slot not in best or candidate.sharpness > best[slot].sharpness:
         best[slot] = candidate
@@ -161,10 +161,10 @@ def choose_by_time(candidates: Sequence[Candidate], max_views: int) -> list[Cand
 
 
 def choose_by_parallax(candidates: Sequence[Candidate], max_views: int) -> list[Candidate]:
-    """Choose candidates at even steps of image change, and around each step the sharpest.
+    """Choose candidates at even steps of image change, near each step the sharpest.
 
-    The way is measured over frames that differ from the last one measured by more than `SMALLEST_CHANGE`, so noise of a
-    resting camera adds nothing. Up to half way to its neighbours, the sharpest frame stands for each step.
+    The change is summed over frames that differ from the last one counted by more than `SMALLEST_CHANGE`, so noise of a
+    resting camera adds nothing. For each step the sharpest frame up to half way to the neighbouring steps is taken.
     """
     moved, way = _way(np.stack([c.thumbnail for c in candidates]).astype(np.float32).reshape(len(candidates), -1))
     marks = np.linspace(0, way[-1], min(len(moved), max_views))
@@ -174,7 +174,7 @@ def choose_by_parallax(candidates: Sequence[Candidate], max_views: int) -> list[
 
 
 def _way(thumbnails: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (n,) of the frames that moved on, the first included, and the summed change (n,) up to each."""
+    """Indices (n,) of the frames that are counted, the first included, and the summed change (n,) up to each."""
     moved, way = [0], [0.0]
     for k in range(1, len(thumbnails)):
         change = float(np.abs(thumbnails[k] - thumbnails[moved[-1]]).mean())
@@ -231,7 +231,7 @@ def _turned(size_hw: tuple[int, int], rotation: int) -> tuple[int, int]:
 
 
 def _upright(image: np.ndarray, rotation: int) -> np.ndarray:
-    """Turn pixels as the rotation metadata asks; angles that are no quarter turn are rounded to one."""
+    """Turn pixels by the rotation in the metadata, rounded to quarter turns."""
     return np.ascontiguousarray(np.rot90(image, _quarter_turns(rotation)))
 
 

@@ -1,1 +1,1 @@
-"""."""
+"""Files for other tools: point clouds, meshes, cameras and depth maps."""

@@ -1,4 +1,4 @@
-"""What an export format is, and what the formats of one export share.
+"""Description of an export format, and the data that the formats of one export share.
 
 Neither this module nor a format's module loads torch before it writes, since the command line lists the formats.
 """
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 DEFAULT_FORMATS = ("ply", "glb")
 MAX_TRACKS = 100_000
-"""Points of a COLMAP model."""
+"""Default limit of the points of a COLMAP model."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,7 @@ class Format:
     path: str
     """The file or folder that it writes, relative to the folder of the export."""
     about: str
-    """A few words for lists of files."""
+    """Short description for lists of files."""
     write: Callable[[Export], list[Path]]
     """Writes the files and returns their paths."""
     needs_cameras: bool = True
@@ -38,12 +38,12 @@ class Format:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """One export: what is written, where, and how; points are lifted once for all formats."""
+    """One export: what is written, where, and how; the point cloud is computed once for all formats."""
 
     reconstruction: Reconstruction
     folder: Path
     keep: np.ndarray
-    """(S, H, W) bool: pixels to believe."""
+    """(S, H, W) bool: pixels that the filters keep."""
     tolerance: float
     """Relative depth difference up to which two views see one surface."""
     max_points: int | None

@@ -1,8 +1,8 @@
 """``colmap/sparse/0``: a COLMAP model that splatting and bundle adjustment accept (extra ``colmap``).
 
 World and cameras have OpenCV axes in COLMAP too. Cameras are PINHOLE at the original photos' resolution, one per photo;
-images carry the photos' names; pixel centres are at 0.5 (`freegeo.export.pixels`). Photos with an EXIF rotation
-are meant upright. Every point has two or more observations.
+images carry the photos' names; pixel centres are at 0.5 (`freegeo.export.pixels`). Sizes and intrinsics of photos with
+an EXIF rotation are those of the upright photo. Every point has two or more observations.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ def write_depth(reconstruction: Reconstruction, folder: Path, *, keep: np.ndarra
     if keep is not None:
         valid &= keep
     scale = float(depth[valid].max()) / LARGEST if valid.any() else 1.0
-    # A valid depth never becomes the 0 that means none.
+    # At least 1 for a valid depth, since 0 means no depth.
     values = np.where(valid, np.clip(np.rint(np.where(valid, depth, 0) / scale), 1, LARGEST), 0).astype(np.uint16)
     text = PngImagePlugin.PngInfo()
     text.add_text("depth_scale", repr(scale))

@@ -28,11 +28,11 @@ logger = logging.getLogger(__name__)
 _MODULES = (npz, ply, glb, mesh, colmap, nerfstudio, depth_png)
 FORMATS: dict[str, Format] = {module.FORMAT.name: module.FORMAT for module in _MODULES}
 ALL = "all"
-"""Stands for every format."""
+"""Name that selects every format."""
 
 
 def chosen_formats(names: Iterable[str]) -> list[str]:
-    """Return the formats that are meant, each once; UserError for one that does not exist."""
+    """Return the names of the chosen formats, each once, `all` resolved; UserError for one that does not exist."""
     chosen: list[str] = []
     for name in names:
         if name != ALL and name not in FORMATS:
@@ -44,7 +44,7 @@ def chosen_formats(names: Iterable[str]) -> list[str]:
 def filter_reconstruction(
     reconstruction: Reconstruction, *, masks: np.ndarray | None = None, settings: FilterSettings | None = None
 ) -> tuple[np.ndarray, FilterReport]:
-    """Pixels of a reconstruction to believe (S, H, W) bool, and what was removed; arguments as `filter_pixels`."""
+    """Pixels of a reconstruction to keep (S, H, W) bool, and what was removed; arguments as `filter_pixels`."""
     from freegeo.fusion.filtering import filter_pixels
 
     T_cam_world, K = reconstruction.cameras()
@@ -70,7 +70,7 @@ def export(
 
     Args:
         reconstruction: what to write.
-        folder: where the files appear.
+        folder: where the files are written.
         formats: names of `FORMATS`, or `all`.
         filtered: result of `filter_reconstruction`; default: filtered here with the default settings.
         max_points: of `points.ply` and `scene.glb`; None writes all.

@@ -30,7 +30,7 @@ _BOX_FACES = (
 def opencv_to_gltf(vectors: np.ndarray) -> np.ndarray:
     """Turn vectors (..., 3) from OpenCV axes (y down, z forward) to glTF axes (y up, z backward), half a turn about x.
 
-    The one place where the GLB's axes are decided; it is its own inverse.
+    It is its own inverse. No other function converts axes for the GLB file.
     """
     return vectors * np.asarray((1, -1, -1), dtype=vectors.dtype)
 

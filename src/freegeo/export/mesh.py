@@ -91,7 +91,7 @@ def write_mesh(reconstruction: Reconstruction, keep: np.ndarray, path: Path, *, 
 
     Raises:
         UserError: the voxel is not positive.
-        FreeGeoError: no surface comes out.
+        FreeGeoError: the fusion gives no surface.
     """
     import trimesh
 

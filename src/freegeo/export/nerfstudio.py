@@ -1,7 +1,7 @@
-"""``transforms.json`` for nerfstudio: OpenGL camera axes, intrinsics of the original photos, points as a start.
+"""``transforms.json`` for nerfstudio: OpenGL camera axes, intrinsics of the original photos, initial points.
 
-World coordinates stay those of the reconstruction (and of `points.ply`, which the file names), only the cameras' axes
-turn: x right, y up, z backward. Pixel centres are at 0.5.
+World coordinates stay those of the reconstruction (and of `points.ply`, which the file names); only the cameras' axes
+change: x right, y up, z backward. Pixel centres are at 0.5.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ FILE_NAME = "transforms.json"
 
 
 def opengl_camera_to_world(T_cam_world: np.ndarray) -> np.ndarray:
-    """Camera-to-world matrices (S, 4, 4) float64 with OpenGL camera axes; the one place of this format's axes."""
+    """Camera-to-world matrices (S, 4, 4) float64 with OpenGL camera axes."""
     T = T_cam_world.astype(np.float64)
     return np.linalg.inv(T) @ np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -33,7 +33,7 @@ def write_nerfstudio(
     Args:
         reconstruction: with cameras.
         path: of the JSON file.
-        photo_folder: folder of the original photos, relative to the file; it is named, not created.
+        photo_folder: folder of the original photos, relative to the file; it is not created.
         points: name of a point cloud beside the file.
     """
     K = corner_K(reconstruction)

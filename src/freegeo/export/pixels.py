@@ -1,9 +1,9 @@
-"""From the model's pixels to those of the original photos, counted as other tools count them.
+"""From the model's pixels to those of the original photos, in the pixel coordinates of other tools.
 
 freegeo gives the centre of the top left pixel the coordinates (0, 0). COLMAP and nerfstudio count from the image's
-corner, so that the same centre is at (0.5, 0.5). Resizing keeps corners, not centres, in place: a place in the model's
-image is `(u + 0.5 - offset) / scale` in the photo, counted from the corner. These functions are the only ones
-that know it; they keep every 3D point on the image content it was lifted from.
+corner, so that the same centre is at (0.5, 0.5). Resizing keeps corners, not centres, in place: pixel u of the model's
+image is at `(u + 0.5 - offset) / scale` in the photo, counted from the corner. Only these functions convert between
+the two; with them every 3D point projects to the image content that it was lifted from.
 """
 
 from __future__ import annotations

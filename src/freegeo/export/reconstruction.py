@@ -1,6 +1,6 @@
 """One prediction of one scene as NumPy arrays, and its file ``prediction.npz``: what every export starts from.
 
-The keys are field names and stay as they are, because scripts of users read them:
+The keys are field names and must not change, because scripts of users read them:
 
 | key | shape | type | meaning |
 |---|---|---|---|
@@ -128,7 +128,7 @@ class Reconstruction:
 
     @classmethod
     def from_prediction(cls, prediction: Prediction, batch: ImageBatch) -> Reconstruction:
-        """Take over a model's answer for a batch of photos.
+        """Convert a model's prediction for a batch of photos.
 
         Args:
             prediction: tensors (S, ...) or (1, S, ...), on any device.
@@ -157,7 +157,7 @@ class Reconstruction:
         )
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return the content of the file: every field that is there, under its name, and the format."""
+        """Return the content of the file: every field that is not None, under its name, and the format."""
         present = {f.name: getattr(self, f.name) for f in fields(self)}
         arrays = {name: np.asarray(value) for name, value in present.items() if value is not None}
         return {**arrays, "format": np.array(VERSION, np.int64)}
@@ -184,7 +184,7 @@ class Reconstruction:
         """Write files for other tools and return their paths.
 
         Args:
-            folder: where they appear.
+            folder: where they are written.
             formats: names of `freegeo.export.formats.FORMATS`, or all.
             filters: which points are kept; None: the defaults of `FilterSettings`.
             masks: one (H, W) array per photo at its size, not zero where points are wanted.
@@ -216,7 +216,7 @@ class Reconstruction:
 
         Raises:
             UserError: there is no such file, or a newer freegeo wrote it.
-            FreeGeoError: the file is damaged or something else.
+            FreeGeoError: the file is damaged or not a reconstruction.
         """
         file = _file(path)
         if not file.is_file():

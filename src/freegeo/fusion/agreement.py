@@ -24,9 +24,9 @@ __all__ = [
 ]
 
 MAX_NEIGHBOURS = 6
-"""Other views that are asked about a view's pixels."""
+"""Other views that a view's pixels are compared with."""
 TOLERANCE_RANGE = (0.02, 0.15)
-"""Range of the tolerance that is read off the data."""
+"""Range of the tolerance that `tolerance_of` estimates."""
 _QUANTILE, _SPREAD = 0.25, 8.0
 _TOLERANCE_NEIGHBOURS = 2
 _LARGEST_SLOPE = 0.2
@@ -34,7 +34,7 @@ _LARGEST_SLOPE = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class Votes:
-    """Votes on every pixel, (S, H, W) int16; views whose image a pixel's point is outside of do not vote."""
+    """Votes on every pixel, (S, H, W) int16; a view votes only if the pixel's point falls into its image."""
 
     agree: Tensor
     """Other views whose surface lies where this pixel's does."""
@@ -84,7 +84,7 @@ def prepare(depth_z: Tensor, T_cam_world: Tensor, K: Tensor, usable: Tensor, *, 
     allowed = tolerance + relative_slope(known)
     front = torch.nn.functional.pad((known / (1 + allowed)).nan_to_num(torch.inf), (1, 1, 1, 1), value=torch.inf)
     barrier = -torch.nn.functional.max_pool2d(-front[:, None], 2, stride=1)[:, 0]
-    # Where none of the four pixels is usable, nothing is known, so nothing is contradicted.
+    # Where none of the four pixels is usable, a barrier of 0 contradicts nothing.
     return Surfaces(
         depth_z=known,
         T_cam_world=T_cam_world,
@@ -98,8 +98,8 @@ def vote(surfaces: Surfaces, neighbours: Tensor | None = None) -> Votes:
     """Let the views vote on each other's usable pixels.
 
     A pixel's point is carried into another view. If that view has a surface there, it agrees; if it sees farther, one
-    of the two pixels is wrong, and both get a contradiction; if it sees something nearer, the point is hidden, which
-    says nothing. `neighbours` (S, n) are the views to ask, by default `nearest_views`.
+    of the two pixels is wrong, and both get a contradiction; if it sees something nearer, the point is hidden and gets
+    no vote. `neighbours` (S, n) are the views to compare with, by default `nearest_views`.
     """
     if neighbours is None:
         neighbours = nearest_views(surfaces.T_cam_world)
@@ -176,7 +176,7 @@ def nearest_views(T_cam_world: Tensor, count: int = MAX_NEIGHBOURS) -> Tensor:
 
 
 def tolerance_of(depth_z: Tensor, T_cam_world: Tensor, K: Tensor, usable: Tensor) -> float:
-    """Tolerance for `prepare` that fits how well these maps agree: 0.02 to 0.15.
+    """Tolerance for `prepare` from how well these maps agree: 0.02 to 0.15.
 
     It is 8 times the lower quartile of the relative differences between each view and its two nearest (2.5 standard
     deviations of normal noise); hidden points differ more, so the median would overestimate. Exact depth gets the

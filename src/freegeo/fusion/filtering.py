@@ -1,4 +1,4 @@
-"""Which pixels of a reconstruction to believe."""
+"""Filters that decide which pixels of a reconstruction to keep."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ __all__ = ["FilterReport", "confident_pixels", "filter_pixels", "flying_pixels"]
 CONTINUATION_TOLERANCE = 0.03
 """Largest relative distance of a pixel from the straight continuation of its neighbours."""
 SMALL_STEP = 0.015
-"""Relative step to the next pixel that shows a surface without asking for a straight line."""
+"""Relative step to the next pixel up to which both lie on one surface, straight continuation or not."""
 STEEPEST_SLOPE = 12.0
-"""Tangent of the steepest angle (85 degrees) between a surface and the image plane that is believed."""
+"""Tangent of the steepest angle (85 degrees) between a surface and the image plane that is kept."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ def filter_pixels(
     masks: np.ndarray | None = None,
     settings: FilterSettings | None = None,
 ) -> tuple[np.ndarray, FilterReport]:
-    """Decide which pixels to believe.
+    """Decide which pixels to keep.
 
     Args:
         depth_z: (S, H, W).
@@ -108,8 +108,8 @@ def _confirmed(
 ) -> Tensor:
     """Mask of the usable pixels that the other views do not outvote.
 
-    A contradiction counts against both pixels involved, so clear cases (two votes more against than for) leave first,
-    and the rest is judged without them.
+    A contradiction counts against both pixels involved, so clear cases (two votes more against than for) are removed
+    first, and the votes on the rest are counted without them.
     """
     votes = vote(prepare(depth_z, T_cam_world, K, usable, tolerance=tolerance))
     usable = usable & (votes.contradict - votes.agree < 2)
@@ -132,12 +132,12 @@ def confident_pixels(conf: Tensor, usable: Tensor, *, drop_share: float) -> Tens
 
 
 def flying_pixels(depth_z: Tensor, K: Tensor) -> Tensor:
-    """Mask (S, H, W) of pixels that hang between surfaces, as at depth edges.
+    """Mask (S, H, W) of pixels whose depth lies between surfaces, as at depth edges.
 
     Along a row and along a column, inverse depth of a plane is linear. A pixel of a surface is close to its
     neighbour, or continues the line through the next two pixels, on at least one side, also at the surface's rim; a
-    pixel between two surfaces, or alone in the air, does neither. A blurred edge is smooth, but steeper than a surface
-    that a camera sees: beyond `STEEPEST_SLOPE` on both sides a pixel is dropped too.
+    pixel between two surfaces, or an isolated one, does neither. A blurred edge is smooth, but steeper than a surface
+    that a camera sees: a pixel steeper than `STEEPEST_SLOPE` on both sides is dropped too.
 
     Args:
         depth_z: (S, H, W); invalid depth is never continued, and is not itself flagged.
@@ -161,6 +161,6 @@ def _side(inverse: Tensor, focal: Tensor) -> Tensor:
     far = torch.nn.functional.pad(inverse, (2, 0), value=torch.nan)[..., :-2]
     steepest = STEEPEST_SLOPE / focal.to(inverse)[:, None, None]
     step = (inverse - near).abs()
-    # Comparisons with NaN, the pixels that do not exist, are false.
+    # Pixels outside the map are NaN, and comparisons with NaN are false.
     on_line = (inverse - (2 * near - far)).abs() <= CONTINUATION_TOLERANCE * inverse
     return (on_line | (step <= SMALL_STEP * inverse)) & (step <= steepest * inverse)

@@ -58,7 +58,7 @@ def coloured_points(
     max_points: int | None = MAX_POINTS,
     seed: int = 0,
 ) -> PointCloud:
-    """World points of the pixels worth showing, in the order view, row, column.
+    """World points of the pixels that pass the filters, in the order view, row, column.
 
     Args:
         depth_z: (S, H, W).

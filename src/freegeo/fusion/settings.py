@@ -1,4 +1,4 @@
-"""What decides which pixels become points, and how many points: defaults that the command line shows too.
+"""Settings of which pixels become points, and how many: defaults that the command line shows too.
 
 This module loads no torch.
 """
@@ -12,7 +12,7 @@ from freegeo.errors import UserError
 DROP_SHARE = 0.4
 """Least confident share of the pixels that exports leave out, as the published ones do."""
 MAX_POINTS = 1_000_000
-"""Points of a cloud; of more, as many are chosen at random."""
+"""Most points of a cloud; of more, a random choice is kept."""
 
 
 @dataclass(frozen=True, kw_only=True)

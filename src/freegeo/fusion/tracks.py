@@ -1,4 +1,4 @@
-"""Points that several views observe, from depth maps alone: what structure-from-motion tools work with."""
+"""Points that several views observe, as structure-from-motion tools need them, from depth maps alone."""
 
 from __future__ import annotations
 

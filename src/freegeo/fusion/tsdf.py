@@ -24,7 +24,7 @@ _CUDA_CHUNK_BLOCKS = 2048
 
 
 class TsdfVolume:
-    """A growing set of voxel blocks that remembers the surface seen so far.
+    """A growing set of voxel blocks that stores the surface seen so far.
 
     ```python
     volume = TsdfVolume(voxel=0.02, truncation=0.08)
@@ -40,7 +40,7 @@ class TsdfVolume:
         Args:
             voxel: voxel edge in metres.
             truncation: distance in metres at which the signed distance is cut.
-            device: where the volume lives and frames are integrated.
+            device: of the volume and of the integration.
         """
         if not (voxel > 0 and truncation > 0):
             raise UserError(f"Voxel edge and truncation must be positive, not {voxel} and {truncation}.")
@@ -66,8 +66,8 @@ class TsdfVolume:
     def integrate(self, depth_z: Tensor, K: Tensor, T_cam_world: Tensor, *, depth_limit: float = float("inf")) -> None:
         """Add one depth map.
 
-        Only blocks near this frame's own surface are touched, so free space is carved nowhere else. Surface farther
-        than 2^20 blocks from the world origin is left out.
+        Only blocks near this frame's own surface are updated; free space elsewhere is not carved. Surface farther than
+        2^20 blocks from the world origin is left out.
 
         Args:
             depth_z: (H, W) metres; values that are not finite, not positive, or from `depth_limit` on are ignored.
@@ -163,7 +163,7 @@ class _Frame:
         self.shift_u, self.shift_v = float(cx + 0.5), float(cy + 0.5)
         u = (torch.arange(self.width, device=depth.device) - cx) / fx
         v = (torch.arange(self.height, device=depth.device) - cy) / fy
-        # A pixel without depth is infinitely near: its distances fall below any truncation by themselves.
+        # A depth of -inf puts the distances of a pixel without depth below any truncation, so it changes no voxel.
         self.depth = torch.where(depth > 0, depth, float("-inf")).flatten()
         self.ray_length = (1 + u**2 + v[:, None] ** 2).sqrt().float().flatten()
 

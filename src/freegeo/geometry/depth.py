@@ -1,4 +1,4 @@
-"""Depth maps and the points they stand for. ``depth_z`` is the coordinate along the optical axis, not a distance."""
+"""Depth maps and their points. ``depth_z`` is the coordinate along the optical axis, not the distance to the camera."""
 
 import torch
 from torch import Tensor

@@ -42,7 +42,7 @@ def cameras_from_rays(
         FreeGeoError: a view has fewer than eight usable rays.
     """
     leading, (height, width) = rays.shape[:-3], rays.shape[-3:-1]
-    # The normal matrix squares the condition number: float64 keeps the digits of a float32 map.
+    # The normal matrix squares the condition number; float64 keeps the precision of a float32 map.
     flat = rays.reshape(-1, height * width, 6).double()
     weights = confidence.reshape(-1, height * width).double()
     grid = _normalised_grid(height, width, like=flat)

@@ -1,4 +1,4 @@
-"""Where the pixels of one view land in another."""
+"""Reprojection of the pixels of one view into another."""
 
 from dataclasses import dataclass
 

@@ -73,7 +73,7 @@ def matrix_to_quat_xyzw(matrix: Tensor) -> Tensor:
 def rotation_angle(matrix_a: Tensor, matrix_b: Tensor) -> Tensor:
     """Angle (...), radians 0..pi, of the rotation between two rotation matrices (..., 3, 3).
 
-    Sine and cosine are both used, so tiny angles and half turns keep their digits (an arc cosine would lose half).
+    Sine and cosine are both used, so tiny angles and half turns stay precise (an arc cosine loses half the digits).
     """
     relative = matrix_a.mT @ matrix_b
     skew = relative - relative.mT

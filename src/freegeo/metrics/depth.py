@@ -32,7 +32,7 @@ def score_depth(
     Args:
         depth_pred: (..., S, H, W), any positive scale.
         depth_gt: (..., S, H, W) metres.
-        valid: (..., S, H, W) bool, pixels to look at. A pixel also needs a finite positive depth on both sides.
+        valid: (..., S, H, W) bool, pixels to score. A pixel also needs a finite positive depth on both sides.
         align: "median" scales the prediction by the median of d_gt / d over the valid pixels of all views (the lower
             one of two middle values); "none" takes it as it is.
 

@@ -23,7 +23,7 @@ class PairErrors(NamedTuple):
     rotation_deg: Tensor
     """Full angle between the two relative rotations, 0 to 180; NaN where a matrix is not finite."""
     translation_deg: Tensor
-    """Angle between the two baselines with the sign folded away, 0 to 90; 1e6 where it is not finite."""
+    """Angle between the two baselines up to sign, 0 to 90; 1e6 where it is not finite."""
 
     @property
     def worst_deg(self) -> Tensor:
@@ -123,7 +123,7 @@ def _quaternion(R: Tensor) -> Tensor:
     """Quaternion (..., 4), scalar last, by the largest of its four numbers.
 
     Not the function of `freegeo.geometry`: near zero the error is rounding of float32 and of matrices that are not
-    quite rotations. The order of operations, and a length left as it comes, are part of the published numbers.
+    quite rotations. The order of operations, and not normalising the result, affect the published numbers.
     """
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = R.flatten(-2).unbind(-1)
     traces = [1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22, 1 + m00 + m11 + m22]

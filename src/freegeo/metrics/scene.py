@@ -60,5 +60,5 @@ def evaluate(reconstruction: Reconstructed, scene: Scene) -> dict[str, float]:
 
 
 def at_size(depth_z: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Take ground truth to a prediction's size: nearest depth, scaled intrinsics."""
+    """Resize ground truth to a prediction's size: nearest depth, scaled intrinsics."""
     return resize_nearest(depth_z, size), resize_K(K, (depth_z.shape[-2], depth_z.shape[-1]), size)

@@ -1,7 +1,7 @@
 """The contract of a reconstruction model: embed, aggregate, decode (docs/architecture.md).
 
 `embed` sees one image at a time and is never adapted; `aggregate` mixes the views and is the only place where an
-adapter lives; `decode` turns the features of any selection of views into depth and cameras.
+adapter acts; `decode` turns the features of any selection of views into depth and cameras.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class ReconstructionModel(nn.Module, ABC):
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:
         """Run everything below the first cross-view layer on images (B, S, 3, H, W) in [0, 1].
 
-        `layers` names the layers that will be asked of `aggregate`; None means all that the decoder reads.
+        `layers` are those that `aggregate` will return; None means all that the decoder reads.
         """
 
     @abstractmethod
@@ -53,7 +53,7 @@ class ReconstructionModel(nn.Module, ABC):
 
     @abstractmethod
     def decode(self, features: Features, *, want: Collection[Want] = ("depth", "cameras")) -> Prediction:
-        """Read depth and cameras off the features of the views given; everything has leading dimensions (B, S)."""
+        """Predict depth and cameras from the features of the given views; results have leading dimensions (B, S)."""
 
     @abstractmethod
     def adapter_targets(self) -> list[str]:
@@ -73,21 +73,21 @@ class ReconstructionModel(nn.Module, ABC):
 
 
 def check_layers(layers: Collection[int], depth: int, model: str) -> None:
-    """Raise UserError when a layer is asked for that a model of `depth` layers does not have."""
+    """Raise UserError when `layers` has one that a model of `depth` layers does not have."""
     unknown = sorted(set(layers) - set(range(depth)))
     if unknown or not layers:
         raise UserError(f"{model} has layers 0 to {depth - 1}; asked for {unknown or 'none'}. Choose among them.")
 
 
 def check_want(want: Collection[str], offered: Collection[Want], model: str) -> None:
-    """Raise UserError when something is asked of `decode` that a model does not predict."""
+    """Raise UserError when `want` has something that a model does not predict."""
     unknown = sorted(set(want) - set(offered))
     if unknown:
         raise UserError(f"{model} does not predict {', '.join(unknown)}. Choose among {', '.join(sorted(offered))}.")
 
 
 def level_tokens(features: Features, layers: Collection[int], model: str) -> list[tuple[Tensor, Tensor]]:
-    """Return the features of the layers a head reads; UserError when `aggregate` was told to leave one out."""
+    """Return the features of the layers a head reads; UserError when one is not in `features`."""
     missing = [layer for layer in layers if layer not in features.levels]
     if missing:
         raise UserError(

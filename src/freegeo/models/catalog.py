@@ -101,7 +101,7 @@ def download(name: str) -> Path:
 
 
 def _require_reachable(url: str) -> None:
-    """Ask for a file's header once, without the hub library's retries, which take half a minute when offline."""
+    """Request a file's headers once, without the hub library's retries, which take half a minute when offline."""
     import huggingface_hub
 
     hub_logger = logging.getLogger("huggingface_hub")

@@ -23,7 +23,7 @@ _BLOCKS = 64
 
 
 def find_file(path: Path) -> Path:
-    """Return the weight file a path stands for: itself, or the one weight file in a folder."""
+    """Return the path of a weight file itself, or for a folder the one weight file in it."""
     if path.is_file():
         return path
     if not path.exists():
@@ -114,7 +114,7 @@ def save_weights(model: nn.Module, path: Path, rules: KeyRules, metadata: Mappin
 
 
 def _require_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
-    # The two extremes carry any NaN or infinity, and need one pass and no memory of the tensor's size.
+    # Minimum and maximum show any NaN or infinity, in one pass and without memory of the tensor's size.
     damaged = [name for name, value in tensors.items() if not torch.stack(value.aminmax()).isfinite().all()]
     if damaged:
         raise UserError(

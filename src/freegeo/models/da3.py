@@ -57,7 +57,7 @@ class Backbone(nn.Module):
         self.recompute = False
 
     def is_global(self, index: int) -> bool:
-        """Say whether a block attends across views."""
+        """Whether a block attends across views."""
         return index >= self.config.alt_start and index % 2 == 1
 
     def embed(self, images_VXHW: Tensor, keep: Collection[int]) -> tuple[Tensor, dict[str, Tensor]]:
@@ -127,7 +127,7 @@ class Backbone(nn.Module):
 
     def position_embedding(self, grid_hw: tuple[int, int]) -> Tensor:
         """Return the embedding (1, N, D) of a patch grid."""
-        # The tenth of a patch stays inside the sampling scale: official checkpoints were trained with it.
+        # The 0.1 is part of the sampling scale that official checkpoints were trained with.
         rows, columns = ((n + 0.1) / self.config.position_grid for n in grid_hw)
         return position_table(self.pos_embed, grid_hw, scale_factor=(rows, columns))
 
@@ -250,7 +250,7 @@ class DA3(ReconstructionModel):
             return self.cam_enc(encode_camera_to_world(cameras.T_cam_world, cameras.K, image_hw))
 
     def decode(self, features: Features, *, want: Collection[Want] = ("depth", "cameras")) -> Prediction:
-        """Read out depth, confidence, cameras and (only when asked) rays, in float32."""
+        """Read out depth, confidence, cameras and (only if in `want`) rays, in float32."""
         check_want(want, ("depth", "cameras", "rays"), self.spec.name)
         maps: dict[str, Tensor] = {}
         with torch.autocast(next(iter(features.levels.values()))[0].device.type, enabled=False):

@@ -94,7 +94,7 @@ KEYS = KeyRules(
     skipped=("gs_head.",),
     aliases={f"{_NORM}.{level}.2.{leaf}": f"{_NORM}.0.2.{leaf}" for level in (1, 2, 3) for leaf in ("weight", "bias")},
 )
-"""Official checkpoints: a prefix, a Gaussian head that is left out, and one norm that stands in four places."""
+"""Official checkpoints: a prefix, a Gaussian head that is left out, and one norm that is shared by four layers."""
 
 
 def build(config: DA3Config, spec: ModelSpec) -> DA3:

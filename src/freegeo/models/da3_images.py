@@ -23,7 +23,7 @@ class SizePlan:
 
     photo: Size
     bounded: Size
-    """The longest side is as asked."""
+    """The longest side is the requested one."""
     bound_step: Step
     final: Size
     """Both sides are multiples of the patch."""
@@ -31,7 +31,7 @@ class SizePlan:
 
 
 def plan_size(photo: Size, side: int, patch: int) -> SizePlan:
-    """Work out the sizes for one photo; UserError when it is too narrow to give one patch."""
+    """Compute the sizes for one photo; UserError when it is too narrow to give one patch."""
     longest = max(photo)
     bounded = (max(1, round(photo[0] * side / longest)), max(1, round(photo[1] * side / longest)))
     rows, columns = ((n + patch // 2) // patch * patch for n in bounded)

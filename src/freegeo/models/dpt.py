@@ -120,7 +120,7 @@ class Scratch(nn.Module):
         self.output_conv2 = read_out(features, outputs)
         if ray_branch:
             self.output_conv1_aux = nn.ModuleList(self._ray_trunk(features) for _ in range(4))
-            # One norm module stands in all four read-outs: the checkpoint stores it once, under level 0.
+            # One norm module is shared by all four read-outs; the checkpoint stores it once, under level 0.
             norm = nn.LayerNorm(HIDDEN, eps=1e-5)
             self.output_conv2_aux = nn.ModuleList(self._ray_read_out(features, norm) for _ in range(4))
 

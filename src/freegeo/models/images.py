@@ -1,4 +1,4 @@
-"""What every model here does with images: normalisation, the patch grid, and the way back to the photos."""
+"""What every model here does with images: normalisation, the patch grid, and the mapping back to the photos."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class Compute:
 
     @classmethod
     def choose(cls, device: str | None = None, precision: str | None = None) -> Compute:
-        """Return the device and precision asked for, or the best at hand; UserError when they are not there."""
+        """Return the given device and precision, or the best available; UserError when one is not available."""
         chosen = choose_device(device)
         return cls(device=chosen, precision=choose_precision(precision, chosen))
 
@@ -35,7 +35,7 @@ class Compute:
 
 
 def choose_device(name: str | None) -> torch.device:
-    """Return the device asked for, or the best one at hand; UserError when it is not there."""
+    """Return the device of that name, or the best one available; UserError when it is not available."""
     if name is None:
         if torch.cuda.is_available():
             return torch.device("cuda")
@@ -53,7 +53,7 @@ def choose_device(name: str | None) -> torch.device:
 
 
 def choose_precision(name: str | None, device: torch.device) -> Precision:
-    """Return the precision asked for, or bf16 on a CUDA device that has it, else fp32."""
+    """Return the precision of that name; None: bf16 on a CUDA device that has it, else fp32."""
     if name is None:
         return "bf16" if device.type == "cuda" and torch.cuda.is_bf16_supported() else "fp32"
     for known in PRECISIONS:

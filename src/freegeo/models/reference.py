@@ -1,4 +1,4 @@
-"""Which view the others are described in: the rules of docs/models/da3.md, "Reference view"."""
+"""Choice of the reference view, whose frame the others are predicted in (docs/models/da3.md, "Reference view")."""
 
 from __future__ import annotations
 

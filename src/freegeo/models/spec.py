@@ -1,4 +1,4 @@
-"""What a model says about itself, and one line of the catalog. Importing this file does not import torch."""
+"""Description of a model, and its entry in the catalog. Importing this file does not import torch."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptationDefaults:
-    """What the method needs to know of one model: the published or measured settings that depend on its features."""
+    """Settings of the method that depend on the model's features, published or measured."""
 
     temperature: float
     """Softmax temperature of the relational loss; about .6 to .8 of the features' rms."""
@@ -21,14 +21,14 @@ class AdaptationDefaults:
     """Peak learning rate of the recipe `scene`."""
     rank: int = 32
     neighbours: bool = False
-    """Whether the model was trained on neighbouring frames only, so that its view sets are frames in a row."""
+    """Whether the model was trained on neighbouring frames only, so that its view sets are consecutive frames."""
     published: Literal["da3", "vggt"] | None = None
     """Which of the two published families of settings a dataset recipe takes; None: the paper's DA3 column."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelSpec:
-    """What others need to know of a model without looking inside."""
+    """The properties of a model that the rest of the package uses."""
 
     name: str
     patch_size: int
@@ -76,7 +76,7 @@ class ModelEntry:
     """Licence of the weights."""
     parameters: int
     build: Callable[[], ReconstructionModel] | None = None
-    """Builds the model without weights; None: known, but not implemented."""
+    """Builds the model without weights; None: listed, but not implemented."""
     keys: KeyRules = KeyRules()
     """Rules that translate the checkpoint's names; by default the names are the model's own."""
     hub_id: str | None = None

@@ -53,7 +53,7 @@ class PatchEncoder(nn.Module):
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, config.position_grid**2 + 1, width))
         self.register_tokens = nn.Parameter(torch.zeros(1, config.registers, width))
-        # Left over from DINOv2's training and never read; it is here because checkpoints are matched name by name.
+        # From DINOv2's training and never read; it is here because checkpoints must match name by name.
         self.mask_token = nn.Parameter(torch.zeros(1, width))
         self.blocks = nn.ModuleList(
             Block(width, config.encoder_heads, norm_eps=ENCODER_EPS) for _ in range(config.encoder_depth)
@@ -231,7 +231,7 @@ class VGGT(ReconstructionModel):
         return Features(levels=levels, image_hw=tokens.image_hw, grid_hw=tokens.grid_hw)
 
     def decode(self, features: Features, *, want: Collection[Want] = ("depth", "cameras")) -> Prediction:
-        """Read out depth, cameras and (only when asked) world points, in float32."""
+        """Read out depth, cameras and (only if in `want`) world points, in float32."""
         check_want(want, ("depth", "cameras", "points"), self.spec.name)
         levels = level_tokens(features, self.config.out_layers, self.spec.name)
         patches = [patch for patch, _ in levels]

@@ -27,7 +27,7 @@ class SizePlan:
 
 
 def plan_size(photo: Size, side: int, patch: int) -> SizePlan:
-    """Work out the size for one photo; UserError when it would not fill a patch."""
+    """Compute the size for one photo; UserError when it would not fill a patch."""
     if min(photo) < patch:
         raise UserError(
             f"a photo of {photo[1]} x {photo[0]} pixels is too small or too narrow: the model reads patches of "

@@ -1,4 +1,4 @@
-"""Pictures of a report: colour-coded maps as data URIs, curves and plans as SVG that follows the page's colours."""
+"""Pictures of a report: colour-coded maps as data URIs, curves and plans as SVG in the page's colours."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SMALL_WIDTH = 160
 """Up to this width pictures are stored without loss."""
 INVALID_GREY = 128
 DEPTH_MAP, CONF_MAP, ERROR_MAP, CHANGE_MAP = "viridis_r", "cividis", "inferno", "RdBu_r"
-# Placeholders that the page's own colours replace, so that one figure suits light and dark.
+# Placeholders that the page's colours replace, so that one figure works in light and dark mode.
 _INK, _FAINT = "#010203", "#040506"
 _STAGE_INK = {"frozen": "#070809", "adapted": "#0a0b0c", "truth": "#0d0e0f"}
 _PAGE_COLOURS = {
@@ -31,7 +31,7 @@ _PAGE_COLOURS = {
 
 
 def log_range(maps: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Common range of positive maps, from the 2nd to the 98th percentile; (1, 2) when there is nothing to see."""
+    """Common range of positive maps, from the 2nd to the 98th percentile; (1, 2) without valid values."""
     values = np.concatenate([m[np.isfinite(m) & (m > 0)].ravel() for m in maps])
     if values.size == 0:
         return 1.0, 2.0
@@ -169,7 +169,7 @@ def _svg(figure: Any) -> str:
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
-    # What stands before is for files of their own, and the description inside names addresses.
+    # Inline SVG needs no XML header, and the metadata holds URLs.
     text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
     opening, rest = text.split(">", 1)
     attributes = [part for part in opening.split() if not part.startswith(("width=", "height="))]

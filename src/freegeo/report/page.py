@@ -1,4 +1,4 @@
-"""``report.html``: one page, in one file without links to anything, that shows what a run did."""
+"""``report.html``: one self-contained page that shows the settings and results of a run."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ FILE_NAME = "report.html"
 TEMPLATE = "report.html.j2"
 Range = tuple[float, float]
 CHANGE_LIMIT = 0.2
-"""Relative depth change that has the last colour."""
+"""Relative depth change at the end of the colour scale."""
 MANY_VIEWS, NARROW_WIDTH = 16, 224
-"""Beyond so many views pictures are narrower."""
+"""With more than `MANY_VIEWS` views, pictures are at most `NARROW_WIDTH` pixels wide."""
 SCORE_LABELS = {
     "auc03": "AUC@3°", "auc05": "AUC@5°", "auc15": "AUC@15°", "auc30": "AUC@30°", "abs_rel": "depth error (abs-rel)",
     "f1_rel5": "F1 of points",
@@ -55,7 +55,7 @@ def write_report(folder: Path, *, truth: Reconstruction | None = None) -> Path:
 
 
 def render(result: Result) -> str:
-    """The page as text; everything that is not ours is escaped by the template engine."""
+    """The page as text; the template engine escapes values such as names of photos."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 
@@ -100,7 +100,7 @@ FILES = (
 
 
 def facts(result: Result) -> list[tuple[str, str]]:
-    """The few things to know first."""
+    """The key facts at the top of the page, as (name, value)."""
     summary, final = result.summary, result.final
     height, width = final.depth_z.shape[1:]
     found = [
@@ -225,7 +225,7 @@ def score_table(scores: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def filter_tables(result: Result) -> list[dict[str, Any]]:
-    """What the filters took, per model; of the exported one, what the run itself noted down."""
+    """Pixels that the filters removed, per model; for the exported one, as the run stored them."""
     noted = result.summary.get("filters")
     tables = []
     for stage in result.predictions:

@@ -1,4 +1,4 @@
-"""What an output folder holds, brought into one frame and scale so that it can be shown together.
+"""The reconstructions of an output folder, moved into one world frame and scale for comparison.
 
 A model before and after adaptation gives two reconstructions, each with its own world frame and scale. With ground
 truth both are moved onto it, otherwise the one before onto the one after.
@@ -45,13 +45,13 @@ class Stage:
     keep: np.ndarray
     """(S, H, W) bool: what the export's filters keep; all valid depth of ground truth or without cameras."""
     removed: Mapping[str, int]
-    """Pixels taken by each filter; empty where none ran."""
+    """Pixels removed by each filter; empty where none ran."""
     error: np.ndarray | None = None
     """(S, H, W) float32 |d - d_true| / d_true, NaN where one of them is not valid; None without ground truth."""
 
     @property
     def label(self) -> str:
-        """The name for people."""
+        """The name shown in the report."""
         return LABELS[self.key]
 
     def world_points(self) -> np.ndarray:
@@ -74,7 +74,7 @@ class Result:
     scores: Mapping[str, Any]
     """Content of scores.json; empty when there is none."""
     stages: Mapping[str, Stage]
-    """In the order frozen, adapted, truth, those there are."""
+    """Those that exist, in the order frozen, adapted, truth."""
     names: Sequence[str]
     images: np.ndarray
     """(S, H, W, 3) uint8, what the model read."""
@@ -83,12 +83,12 @@ class Result:
 
     @property
     def predictions(self) -> list[Stage]:
-        """The stages that a model made."""
+        """The stages other than ground truth."""
         return [stage for stage in self.stages.values() if stage.key != "truth"]
 
     @property
     def final(self) -> Stage:
-        """What the exported files show: adapted where there is an adapter."""
+        """The stage that was exported: adapted where there is an adapter, else frozen."""
         return self.predictions[-1]
 
     @property
@@ -165,7 +165,7 @@ def align(estimate: Reconstruction, reference: Reconstruction) -> Sim3:
     """Similarity from an estimate's world frame to a reference's, both of the same views and size.
 
     The scale is the median ratio of depths, the rotation the mean over the cameras, the translation the median over
-    their centres. Unlike a fit to the centres alone it stands also for cameras on a line or in one place.
+    their centres. Unlike a fit to the centres alone it also works for cameras on a line or in one place.
     """
     return _similarity(estimate.depth_z, estimate.cameras()[0], reference.depth_z, reference.cameras()[0])
 

@@ -1,4 +1,4 @@
-"""The 3D scene of a report: a level frame to look at it in, and its points packed for the page."""
+"""The 3D scene of a report: a level frame for display, and its points packed for the page."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from freegeo.export.glb import frustum_corners
 from freegeo.report.result import Result, Stage
 
 MAX_KEPT, MAX_REMOVED = 36_000, 9_000
-"""Points of one stage in the page; the files beside it hold all."""
+"""Most kept and removed points of one stage in the page."""
 ERROR_LIMIT = 0.3
-"""Relative depth error that has the last colour."""
+"""Relative depth error at the end of the colour scale."""
 NO_ERROR = 255
 
 
@@ -25,7 +25,7 @@ def level_rotation(T_cam_world: np.ndarray) -> np.ndarray:
     R = T_cam_world[:, :3, :3].astype(np.float64)
     up = _unit(-R[:, 1].mean(0), -R[0, 1])
     forward = R[:, 2].mean(0)
-    # Cameras all round, or straight down, have no level mean direction: the first one's right side decides.
+    # Cameras that look all round or straight down have no level mean direction; then the first camera's x axis is used.
     right = _unit(np.cross(forward, up), np.cross(np.cross(up, R[0, 0]), up), least=0.05)
     return np.stack((right, up, np.cross(right, up)))
 
@@ -71,7 +71,7 @@ def _packed(stage: Stage, points: np.ndarray, images: np.ndarray, spacing: float
     valid = np.isfinite(points).all(-1) & (stage.depth_z > 0)
     kept = _choice(np.flatnonzero(stage.keep & valid), MAX_KEPT, rng)
     removed = _choice(np.flatnonzero(~stage.keep & valid), MAX_REMOVED, rng)
-    # In random order, so that what is drawn first hides nothing systematically.
+    # In random order, so that no part of the points is always drawn over another.
     index = rng.permutation(np.concatenate((kept, removed)))
     flag = stage.keep.reshape(-1)[index]
     left_out = max(1.0, int(stage.keep.sum()) / MAX_KEPT) ** 0.5

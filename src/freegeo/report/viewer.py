@@ -1,7 +1,7 @@
 """The interactive viewer: one or two output folders in a browser, through viser.
 
-Points lie in bands of equal confidence, so that moving the confidence slider only hides and shows what the browser
-already has; this keeps it quick also through a tunnel.
+Points are grouped into bands of confidence. Moving the confidence slider only hides and shows bands that the browser
+already has, so it is fast over a slow connection too.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 LOCAL_HOSTS = frozenset({"127.0.0.1", "localhost", "::1"})
 BANDS = 20
 MAX_POINTS = 600_000
-"""Points of one stage that are sent to the browser; of more, a seeded choice."""
+"""Most points of one stage that are sent to the browser; of more, a seeded choice."""
 THUMBNAIL_WIDTH = 240
 FRUSTUM_SHARE = 0.06
 STAGE_COLOURS = {"frozen": (214, 122, 32), "adapted": (42, 124, 204), "truth": (64, 160, 92)}
@@ -42,7 +42,7 @@ Ranges = dict[str, tuple[float, float]]
 
 @dataclass(frozen=True, kw_only=True)
 class Layer:
-    """One stage of one folder, as it is chosen in the viewer."""
+    """One stage of one folder, as it is listed in the viewer."""
 
     label: str
     name: str
@@ -58,7 +58,7 @@ class Viewer:
         viser = _viser()
         self.layers = _layers(results)
         self.names = list(results[0].names)
-        # viser announces itself on stdout; what is said to the user is the command's business.
+        # viser prints its address to stdout, which the command reports itself.
         with redirect_stdout(io.StringIO()):
             self.server = viser.ViserServer(host=host, port=port, label="freegeo", verbose=False)
         self.bands: dict[str, list[Any]] = {}
@@ -159,10 +159,10 @@ class Viewer:
         return next(layer for layer in self.layers if layer.label == self.shown.value)
 
     def _apply(self) -> None:
-        """Show what the controls say."""
+        """Update the scene from the controls."""
         chosen = self._layer()
         first_band = round(self.hidden.value / 100 * BANDS)
-        # Seen from one of the cameras, frusta and their pictures would stand in the way.
+        # Seen from one of the cameras, frusta and their pictures would hide the points.
         cameras = self.with_cameras.value and self.follow.value == OUTSIDE
         with self.server.atomic():
             for layer in self.layers:
@@ -193,7 +193,7 @@ class Viewer:
         self.follow.value = self.follow.options[view + 1]
 
     def _go_to_camera(self) -> None:
-        """Put every visitor where the chosen camera is, looking where it looks."""
+        """Move the view of every connected browser to the pose of the chosen camera."""
         view = self.follow.options.index(self.follow.value) - 1
         if view < 0:
             return
@@ -248,7 +248,7 @@ def open_viewer(folders: Sequence[Path], *, host: str = "127.0.0.1", port: int) 
 
 
 def require_free_port(host: str, port: int) -> None:
-    """Raise UserError when nobody can listen there; viser itself would silently take another port."""
+    """Raise UserError when the port cannot be opened; viser itself would silently take another one."""
     if not 1 <= port <= 65535:
         raise UserError(f"--port must be from 1 to 65535, got {port}.")
     try:
@@ -329,7 +329,7 @@ def _thumbnail(image: np.ndarray) -> np.ndarray:
 
 
 def _mesh(layer: Layer) -> Any:
-    """The mesh of the folder in the viewer's frame; it shows the final stage and stands in that stage's own frame."""
+    """The mesh of the folder, which shows the final stage, moved from that stage's own frame to the viewer's."""
     path = layer.result.folder / MESH_NAME
     if layer.stage is not layer.result.final or not path.is_file():
         return None

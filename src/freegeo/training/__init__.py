@@ -1,1 +1,1 @@
-"""How the embedded model is trained: generated rooms in, `freegeo-tiny` out. Nothing else imports this room."""
+"""Training of the embedded model `freegeo-tiny` on generated rooms. Only `freegeo.cli` imports this package."""

@@ -63,7 +63,7 @@ def draw_batch(
 
 
 def shrink(batch: Batch, factor: float, patch: int) -> Batch:
-    """Resize images and depth to whole patches; the fields of view say how pixels and rays belong together."""
+    """Resize images and depth to whole patches; the fields of view stay."""
     size = [round(n * factor / patch) * patch for n in batch.images.shape[-2:]]
     images = F.interpolate(batch.images.flatten(0, 1), size, mode="bilinear", antialias=True)
     depth_z = F.interpolate(batch.depth_z, size, mode="bilinear")

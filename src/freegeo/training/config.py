@@ -1,4 +1,4 @@
-"""Every number of a training run, and how the run changes as views pass by."""
+"""Every number of a training run, and its schedule over the number of views learned from."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class LossWeights:
 
 @dataclass(frozen=True, kw_only=True)
 class Phase:
-    """What samples are like in one part of the curriculum."""
+    """The samples of one part of the curriculum."""
 
     views: tuple[int, ...]
     """Possible numbers of views in a sample."""
@@ -51,7 +51,7 @@ class TrainConfig:
     begin: tuple[int, int] = (0, 0)
     """Steps and views of the run that this one continues; (0, 0): a start from nothing."""
     peak: float = 1.0
-    """Factor on all learning rates; a run that continues a cooled one wants about 0.2."""
+    """Factor on all learning rates; a run that continues a cooled one needs about 0.2."""
     seed: int = 0
     side: int = 64
     """Longest image side in pixels."""
@@ -94,7 +94,7 @@ class TrainConfig:
                 raise UserError(f"cannot train with {name.replace('_', '-')} {value}. Give {limits}.")
 
     def phase(self, seen: int) -> Phase:
-        """Return what is learned from after `seen` views: short windows come first, and small images."""
+        """Return the phase after `seen` views: short windows and small images come first."""
         side = self.side * 3 // 4 if seen < self.small_until else self.side
         if seen < self.pairs_until:
             return Phase(views=(2, 3), max_stride=1, reach=self.reach, side=side)
@@ -111,5 +111,5 @@ class TrainConfig:
 
     @property
     def cooldown_start(self) -> float:
-        """Views after which the learning rate falls."""
+        """Number of views after which the cool-down begins."""
         return self.begin[1] + (self.views - self.begin[1]) * (1 - self.cooldown)

@@ -11,7 +11,7 @@ from freegeo.files import atomic_path
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """Return a log's lines; what a resumed run repeated counts once. UserError when there is no log."""
+    """Return a log's lines, those that a resumed run repeated only once. UserError when there is no log."""
     if not path.is_file():
         raise UserError(f"{path}: no such training log. Give the log.jsonl of a training run.")
     kept: list[dict[str, Any]] = []
@@ -23,7 +23,7 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 
 
 def plot_learning_curve(log: Path, figure: Path) -> Path:
-    """Draw losses, relative rotation against standing still, pose scores and errors over the views learned from."""
+    """Draw losses, rotation error relative to zero motion, pose scores and errors over the views learned from."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""The training loop: resumable at any moment, one or several processes, as many legs as it takes."""
+"""The training loop: can be stopped and resumed at any moment, with one or several processes."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def train(
 
     The same call continues a stopped run: with one worker it ends with the same tensors as a run that was never
     stopped. A larger `views` continues from the plateau before the cool-down. `workers` processes of one thread each
-    change the shared weights without locks; on another device than the CPU there is one. `continue_from`, the folder of
-    another run, makes this one start where that one stands, with its own settings and rooms. UserError when the folder
+    change the shared weights without locks; on another device than the CPU there is one. `continue_from` is the folder
+    of another run, whose state this one starts from, with settings and rooms of its own. UserError when the folder
     holds a run with other settings or `continue_from` holds none; FreeGeoError when a loss is not finite or a worker
     dies.
     """
@@ -89,7 +89,7 @@ def train(
 
 @contextmanager
 def one_thread(device: str):
-    """Compute with one thread: more of them collapse when the cores are shared with other programs."""
+    """Compute with one thread on the CPU: several become slow when other programs share the cores."""
     before = torch.get_num_threads()
     if device == "cpu":
         torch.set_num_threads(1)
@@ -100,7 +100,7 @@ def one_thread(device: str):
 
 
 class Trainer:
-    """One process's view of a run; the first one also renders, saves, scores and logs."""
+    """The part of one process in a run; the first process also renders, saves, scores and logs."""
 
     def __init__(self, state: State, pool: Pool, config: TrainConfig, folder: Path, lock):
         self.state, self.pool, self.config, self.folder, self.lock = state, pool, config, folder, lock
@@ -137,7 +137,7 @@ class Trainer:
             self.recent[name] = LOG_MEMORY * self.recent.get(name, value) + (1 - LOG_MEMORY) * value
 
     def keep_record(self) -> None:
-        """Save, score and log where it is time to."""
+        """Save, score and log at their intervals."""
         state, (step_before, seen_before) = self.state, self.recorded
         self.recorded = (state.step, state.seen)
         if seen_before < self.config.cooldown_start <= state.seen:
@@ -177,7 +177,7 @@ def keep_settings(config: TrainConfig, folder: Path) -> None:
     settings, defaults = (as_json(asdict(each)) for each in (config, TrainConfig()))
     path = folder / CONFIG
     if path.is_file():
-        before = defaults | read_json(path)  # a run may be older than a setting
+        before = defaults | read_json(path)  # an older run may lack a newer setting
         different = [name for name in settings if name != "views" and before[name] != settings[name]]
         if different:
             raise UserError(f"{folder}: holds a training run with another {', '.join(different)}. Choose a new folder.")
@@ -185,7 +185,7 @@ def keep_settings(config: TrainConfig, folder: Path) -> None:
 
 
 def begin(config: TrainConfig, folder: Path, continue_from: Path | None) -> TrainConfig:
-    """Copy the state of the run to continue, once, and return the settings with where that run stood."""
+    """Copy the state of the run to continue, once, and return the settings with that run's steps and views."""
     start = folder / START_FILE
     if continue_from is not None and not start.is_file():
         if (folder / CONFIG).is_file():
@@ -209,7 +209,7 @@ def shards_at(step: int) -> int:
 
 
 def fill(pool: Pool, step: int, *, render_new: bool) -> None:
-    """Load what a run's step draws from, rendering what is missing when asked to."""
+    """Load the shards that a run's step draws from; `render_new`: render missing ones."""
     while len(pool.shards) < shards_at(step) and pool.grow(render_new=render_new):
         pass
 
@@ -226,7 +226,7 @@ def open_pool(config: TrainConfig, state: State, folder: Path, device: str) -> P
 
 
 def write_weights(state: State, config: TrainConfig, path: Path) -> Path:
-    """Write the averaged weights in half precision, under the official DA3 names, with where they come from."""
+    """Write the averaged weights in half precision, under the official DA3 names, with metadata of the run."""
     tensors = {f"model.{name}": value.half().cpu() for name, value in state.average.items()}
     metadata = {
         "freegeo": __version__,

@@ -21,20 +21,20 @@ from freegeo.types import Features
 
 CELLS = 2
 DEPTH_CELLS = 4
-"""Cells along a patch's side whose depth a linear map must know: depth for every view at the price of one product."""
+"""Cells along a patch's side whose depth a linear map predicts, in every view."""
 MATCH_WIDTH = 64
 MATCH_LEVELS = (0, 2)
-"""Output levels whose patches are asked for their partners, the first one because the later ones build on it."""
+"""Output levels of the matching term; the first one is included because the later ones build on it."""
 MATCH_TEMPERATURE = 0.07
 RAYS_PER_PATCH_SIDE = 8
 POSITION_LEVELS = (1, 2, 3)
-"""Output levels whose patches must say where the first view sees their point: what attention has to carry over."""
+"""Output levels of `position_term`, which needs information that attention has to carry between views."""
 SMALLEST_BASELINE = 0.1
-"""In mean depths: relative translations are judged against their length, but not against less than this."""
+"""In mean depths: errors of relative translations are divided by their length, but by no less than this."""
 VISIBLE_WITHIN = 0.06
 """Relative depth difference up to which a point counts as seen by the other view."""
 CONFIDENCE_TARGET = 0.3
-"""The confidence that is best for a log-depth error e is this number over e."""
+"""The optimal confidence for a log-depth error e is this number over e."""
 
 
 class ReadOuts(nn.Module):
@@ -146,7 +146,7 @@ def camera_terms(model: DA3, features: Features, batch: Batch, config: TrainConf
     R_pairs, t_pairs = relative_motion(R, t)
     R_pairs_true, t_pairs_true = relative_motion(R_true, t_true)
     views = R.shape[1]
-    # A view's motion to itself is always right and would only dilute the mean.
+    # The motion of a view relative to itself has no error, so it is left out of the mean.
     others = views / (views - 1)
     baseline = t_pairs_true.norm(dim=-1, keepdim=True).clamp_min(SMALLEST_BASELINE)
     absolute = (R - R_true).abs().mean() + (t - t_true).abs().mean()
@@ -160,7 +160,7 @@ def camera_terms(model: DA3, features: Features, batch: Batch, config: TrainConf
 
 
 def zero_motion_rotation(batch: Batch) -> Tensor:
-    """Return the rotation term, before its weight, of a model that thinks the camera stands still."""
+    """Return the rotation term, before its weight, of a model that predicts no motion."""
     R, t = batch.T_world_cam[..., :3, :3], batch.T_world_cam[..., :3, 3]
     views = R.shape[1]
     still = torch.eye(3, device=R.device)
@@ -174,7 +174,7 @@ def relative_motion(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def geometry_terms(read_outs: ReadOuts, features: Features, batch: Batch) -> tuple[Tensor, Tensor]:
-    """Compare rays and points that a linear map reads off the last features."""
+    """Compare rays and points that a linear map predicts from the last features."""
     patch = batch.images.shape[-1] // features.grid_hw[1]
     targets = cell_targets(batch, patch // CELLS)
     tokens = features.levels[max(features.levels)][0]
@@ -186,14 +186,14 @@ def geometry_terms(read_outs: ReadOuts, features: Features, batch: Batch) -> tup
 
 
 def spread(values: Tensor, grid_hw: tuple[int, int], cells: int) -> Tensor:
-    """Lay out what each patch says about its cells (B, S, P, cells^2 c) as an image (B, S, rows, columns, c)."""
+    """Arrange the values of each patch's cells (B, S, P, cells^2 c) as an image (B, S, rows, columns, c)."""
     h, w = grid_hw
     by_patch = values.view(*values.shape[:2], h, w, cells, cells, -1)
     return by_patch.permute(0, 1, 2, 4, 3, 5, 6).flatten(4, 5).flatten(2, 3)
 
 
 def cell_depth_term(read_outs: ReadOuts, features: Features, batch: Batch) -> Tensor:
-    """Compare the log depth that a linear map reads off the last features, in every view."""
+    """Compare the log depth that a linear map predicts from the last features, in every view."""
     tokens = features.levels[max(features.levels)][0]
     log_depth = spread(read_outs.log_depth(tokens), features.grid_hw, DEPTH_CELLS)[..., 0]
     cell = batch.depth_z.shape[-1] // log_depth.shape[-1]
@@ -202,13 +202,13 @@ def cell_depth_term(read_outs: ReadOuts, features: Features, batch: Batch) -> Te
 
 
 def given(part: Tensor | None) -> Tensor:
-    """Return a part of a prediction that was asked for."""
+    """Return a part of a prediction that must not be None."""
     assert part is not None
     return part
 
 
 def depth_terms(model: DA3, features: Features, depth_true: Tensor, config: TrainConfig) -> dict[str, Tensor]:
-    """Compare log depth and its gradients; confidence learns where depth errs without steering depth."""
+    """Compare log depth and its gradients; confidence learns the depth error, which is detached."""
     prediction = model.decode(features, want=("depth",))
     depth_z, conf = given(prediction.depth_z), given(prediction.conf)
     difference = depth_z.log() - depth_true.log()
@@ -223,7 +223,7 @@ def depth_terms(model: DA3, features: Features, depth_true: Tensor, config: Trai
 
 
 def ray_branch_term(model: DA3, features: Features, batch: Batch, chosen: Choice) -> Tensor:
-    """Train the ray branch of the dense head on features it does not change."""
+    """Train the ray branch of the dense head on detached features."""
     detached = replace(features, levels={i: (p.detach(), s.detach()) for i, (p, s) in features.levels.items()})
     rays = given(model.decode(detached, want=("rays",)).rays)
     patch = batch.images.shape[-1] // features.grid_hw[1]
@@ -235,7 +235,7 @@ def ray_branch_term(model: DA3, features: Features, batch: Batch, chosen: Choice
 
 
 def matching_term(read_outs: ReadOuts, features: Features, batch: Batch) -> Tensor:
-    """Ask each patch for its partner in another view (InfoNCE); hidden and outside points are left out."""
+    """Match each patch with its partner in another view (InfoNCE); hidden and outside points are left out."""
     views, device = batch.images.shape[1], batch.images.device
     pairs = sorted({(0, j) for j in range(1, views)} | {(j - 1, j) for j in range(1, views)})
     first, second = (torch.tensor(side, device=device) for side in zip(*pairs, strict=True))
@@ -250,7 +250,7 @@ def matching_term(read_outs: ReadOuts, features: Features, batch: Batch) -> Tens
 
 
 def position_term(read_outs: ReadOuts, features: Features, batch: Batch) -> Tensor:
-    """Ask each patch of the other views where the first view sees its point, in image widths and heights."""
+    """Predict for each patch of the other views where the first view sees its point, in image widths and heights."""
     second = torch.arange(1, batch.images.shape[1], device=batch.images.device)
     seen = sightings(batch, features.grid_hw, second, torch.zeros_like(second))
     size = batch.fov_vh.new_tensor(batch.depth_z.shape[-2:])

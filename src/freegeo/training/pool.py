@@ -13,7 +13,7 @@ from freegeo.files import write_tensors
 
 ROOMS_PER_SHARD = 96
 ASPECTS = ((1, 1), (3, 4), (2, 3))
-"""Height to width of the images; shards take turns."""
+"""Height to width of the images; successive shards cycle through them."""
 
 
 @dataclass(frozen=True, kw_only=True)

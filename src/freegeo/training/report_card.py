@@ -34,21 +34,21 @@ ROOMS_PER_BATCH = 8
 ASPECT = (3, 4)
 GAP_METRICS = ("auc30", "auc15", "auc05", "f1", "abs_rel", "rotation_deg", "translation_deg")
 PREMISE_METRICS = ("auc30", "auc15", "f1")
-"""Metrics whose 8->4 minus 4 interval has to leave out zero on the good side."""
+"""Metrics whose interval of 8->4 minus 4 has to lie above zero."""
 REPORTED_DOMAINS = ("test-id", "light", "lowtex", "tex", "big", "sparse", "lens")
 """Domains of the shipped model's card; the first is the distribution that it was trained on."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Gate:
-    """One number that the checkpoint is asked to reach with 4 views in distribution."""
+    """A limit that the checkpoint has to reach with 4 views in distribution."""
 
     metric: str
     limit: float
     at_least: bool
 
     def reached(self, value: float) -> bool:
-        """Say whether a value is good enough."""
+        """Whether a value is within the limit."""
         return value >= self.limit if self.at_least else value <= self.limit
 
 
@@ -73,7 +73,7 @@ class RoomScores:
         return {name: float(np.nanmean(values)) for name, values in self.per_room[mode].items()}
 
     def gap(self, metric: str) -> Interval:
-        """Return the paired interval of "8->4" minus "4": what the held-out views are worth."""
+        """Return the paired interval of "8->4" minus "4", the gain from the held-out views."""
         return paired_interval(self.per_room["8->4"][metric] - self.per_room["4"][metric])
 
 
@@ -93,7 +93,7 @@ def score_rooms(
 
 @lru_cache(maxsize=8)
 def evaluation_rooms(domain: str, first: int, count: int, size: tuple[int, int]) -> Rooms:
-    """Render some rooms of a domain; a training run scores the same ones again and again."""
+    """Render some rooms of a domain; cached, as a training run scores the same ones repeatedly."""
     return render_rooms(get_domain(domain).seeds(count, start=first), domain, ALL_VIEWS, size)
 
 
@@ -133,7 +133,7 @@ def score_room(
 
 
 def zero_motion_rotation_deg(truth: Rooms) -> float:
-    """Return the rotation error of a model that never moves: the number a learning model has to beat."""
+    """Return the rotation error of a model that predicts no motion, the baseline for a trained one."""
     still = torch.eye(4).expand_as(truth.T_cam_world)
     return float(pair_errors(se3.inverse(still), truth.T_cam_world).rotation_deg.median())
 
@@ -189,7 +189,7 @@ def gate_lines(card: Mapping[str, Any]) -> list[str]:
 
 
 def card_tables(card: Mapping[str, Any]) -> str:
-    """Return a report card as two Markdown tables: quality, and what the held-out views are worth."""
+    """Return a report card as two Markdown tables: quality, and the gain from the held-out views."""
     columns = ("auc30", "auc15", "auc05", "auc03", "rotation_deg", "translation_deg", "fov_deg", "abs_rel", "f1")
     digits = {name: 2 if name.endswith("_deg") else 3 for name in columns}
     lines = ["| domain (rooms) | mode | " + " | ".join(columns) + " |", "|---" * (len(columns) + 2) + "|"]

@@ -1,4 +1,4 @@
-"""What a training run consists of at any moment: weights, their average, optimisers, counters; shareable, storable."""
+"""State of a training run: weights, their average, optimisers, counters; can be saved and shared by processes."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class State:
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Take over what `tensors` returned."""
+        """Load the values that `tensors` returned."""
         self.model.load_state_dict(saved["model"])
         self.read_outs.load_state_dict(saved["read_outs"])
         for name, value in saved["average"].items():
@@ -126,9 +126,9 @@ def seek_alike(model: DA3) -> None:
 
 @torch.no_grad()
 def start_camera_decoder(model: DA3) -> None:
-    """Let the camera decoder answer "standing still, common lens" at first.
+    """Initialise the camera decoder so that it predicts no motion and a common field of view.
 
-    Its last layers start at zero: the field of view ends in a rectifier, which a random start can switch off for ever.
+    Its last layers start at zero: the field of view ends in a rectifier, which a random start can switch off for good.
     """
     for layer in (model.cam_dec.fc_t, model.cam_dec.fc_qvec, cast(nn.Linear, model.cam_dec.fc_fov[0])):
         nn.init.zeros_(layer.weight)
@@ -137,7 +137,7 @@ def start_camera_decoder(model: DA3) -> None:
 
 
 def build_optimisers(model: DA3, read_outs: ReadOuts, config: TrainConfig) -> tuple[Muon, torch.optim.AdamW]:
-    """Split the parameters: inner matrices to Muon, everything else to AdamW; all their memory exists at once."""
+    """Split the parameters: inner matrices to Muon, everything else to AdamW; their state is allocated here."""
     matrices, others, top = [], [], list(read_outs.parameters())
     for name, parameter in model.named_parameters():
         if parameter.ndim == 2 and name.startswith(MUON_PARTS):

@@ -20,7 +20,7 @@ JOIN_S = 60.0
 
 
 class Crew:
-    """The processes beside the first one; they stop with the block, and when the first process is gone."""
+    """The processes beside the first one; they stop at the end of the block, and when the first process ends."""
 
     def __init__(self, state: State, config: TrainConfig, folder: Path, count: int):
         context = torch.multiprocessing.get_context("spawn")
@@ -52,7 +52,7 @@ class Crew:
 
 
 def work(state: State, config: TrainConfig, folder: Path, lock, stop) -> None:
-    """Train until the first process says stop, or is gone, or the view budget is used up."""
+    """Train until the first process sets `stop` or ends, or the view budget is used up."""
     from freegeo.training.loop import Trainer, open_pool
 
     torch.set_num_threads(1)

@@ -7,9 +7,9 @@ since the squared sides of a triangle give its angles:
     n = (q - p) . (k - p) = u . q - u . p          c = |q - k|^2 = a + b - 2 n
     cosines   n / sqrt(a b)  at p        (b - n) / sqrt(b c)  at k        (a - n) / sqrt(a c)  at q
 
-Why edges, and not k . q for c: an anchor is often close to its reference, and a short side that is the difference of
-large squared norms has lost its digits. The edge u is subtracted first, so a short one keeps its digits, and so do b
-and n. For a and c, which still are such differences, two things help. All tokens are centred on a common vector, which
+Why edges, and not k . q for c: an anchor is often close to its reference, and a short side computed as the difference
+of large squared norms loses its precision. The edge u is formed by subtraction, so u, b and n stay precise where it is
+short. For a and c, which still are such differences, two things help. All tokens are centred on a common vector, which
 changes no side but makes the norms small. And where the two tokens of a side are equal (repeated frames), what is left
 of it is rounding, which must not be taken for a direction: `_branch` says below which length a side counts as zero; its
 cosines are 0 and take no gradient. The bound is that of the inputs' type, so the products must be exact

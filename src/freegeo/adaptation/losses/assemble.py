@@ -1,7 +1,7 @@
 """The adaptation loss: intra + angles + distances, on the features of teacher and student.
 
-`equations` says the same in the paper's words. A new term is computed here, from the tokens p, q and k, and has its
-weight in `LossConfig`.
+`equations` states the same loss as the paper does. A new term is computed here, from the tokens p, q and k, and has
+its weight in `LossConfig`.
 """
 
 from collections.abc import Mapping
@@ -39,12 +39,12 @@ def adaptation_loss(
 
     Args:
         student_levels: per loss layer the patches (B, M, P, C) and special tokens (B, M, T, C) of the kept views. The
-            intra loss is the mean over layers, the relational loss reads the highest layer number.
+            intra loss is the mean over layers, the relational loss uses the highest layer number.
         teacher_levels: the same of the teacher, which saw all views; no gradient goes there.
         held_out: (B, L, C), what `held_out_tokens` returned for the highest layer: the tokens that anchors come from.
-        draws: token positions, on any device; on the features' device nothing has to be moved.
+        draws: token positions, on any device; on the features' device they need not be copied.
         config: which version of the loss.
-        form: see `all_pairs_divergence`; only `pairing` "all" reads it, and None costs a host read per term there.
+        form: see `all_pairs_divergence`; only `pairing` "all" uses it, and None costs a transfer to the host per term.
 
     Terms: `total`; `intra` (weighted) and its unweighted parts `huber` and `cos` (mean of 1 - cosine); `cross`
     (weighted); unweighted `phi1`, `phi2`, `phi3` (angles at reference, anchor, query) and `phi` (weighted sum);
@@ -131,7 +131,7 @@ def _flat_positions(draw: TokenDraw, per_view: int, config: LossConfig, device: 
     """Positions of references and queries in the concatenation of all the student's views."""
     reference, query = draw.reference.to(device), draw.query.to(device).flatten()
     first = config.reference_view * per_view
-    # Queries count through the other views only: those from the reference view on lie one view further.
+    # Query positions do not count the reference view, so those behind it are shifted by one view.
     return reference + first, torch.where(query < first, query, query + per_view)
 
 
@@ -211,8 +211,8 @@ def _outer(kl: Tensor, config: LossConfig) -> Tensor:
 def teacher_spread(kept: Level, held_out: Tensor, draws: StepDraws, config: LossConfig) -> Tensor:
     """The largest spread of the teacher's softmax inputs over the pairs of `pairing` "all", a scalar tensor.
 
-    kept: the teacher's features of the kept views at the cross layer; the rest as in `adaptation_loss`. Read once per
-    view set, `choose_form(spread, headroom=...)` spares the step its host reads.
+    kept: the teacher's features of the kept views at the cross layer; the rest as in `adaptation_loss`. Passed to
+    `choose_form(spread, headroom=...)` once per view set, it saves the transfers to the host of every step.
     """
     p, q = _pooled(_gather_draws(cross_tokens(config, kept), draws, config)[1])
     anchors = widened(anchor_tokens(kept, held_out, draws, config)[1]).flatten(1, 2)
@@ -220,7 +220,7 @@ def teacher_spread(kept: Level, held_out: Tensor, draws: StepDraws, config: Loss
 
 
 def require_finite(terms: Mapping[str, Tensor], *, step: int) -> None:
-    """Raise `FreeGeoError` naming the first term of `terms` (scalars) that is not finite; reads the host once."""
+    """Raise `FreeGeoError` naming the first term of `terms` (scalars) that is not finite; one transfer to the host."""
     finite = torch.stack([term.detach().float() for term in terms.values()]).isfinite().tolist()
     for name, is_finite in zip(terms, finite, strict=True):
         if not is_finite:

@@ -40,7 +40,7 @@ def choose_form(spread: float, *, headroom: float = 1.0) -> KLForm:
     """The cheapest safe evaluation for softmax inputs of this `spread` (see `pair_spread`).
 
     headroom: factor by which the spread may grow before the choice is unsafe; above 1 where the teacher's spread is
-    measured once and stands for a student that drifts from it.
+    measured once and also used for a student that drifts from it.
     """
     if spread * headroom <= FLOAT32_SPREAD:
         return "float32"
@@ -86,7 +86,7 @@ class _ProductPairs(torch.autograd.Function):
         teacher_f = (-teacher_y - teacher_y_top).exp_()
         with exact_matmul(x):
             z, teacher_z = e @ f.mT, teacher_e @ teacher_f.mT
-            # Mean over the teacher's distribution of (x' - y') - (x - y), times Z'. Without x' = x: one product less.
+            # Mean over the teacher's distribution of (x' - y') - (x - y), times Z'. Where x' = x, one product is saved.
             cross = teacher_e @ (teacher_f * (y - teacher_y)).mT
             if not same_x:
                 cross.baddbmm_(teacher_e * (teacher_x - x), teacher_f.mT)

@@ -1,4 +1,4 @@
-"""The losses of the paper (arXiv 2604.14048), one function per equation, as plainly as they are written.
+"""The losses of the paper (arXiv 2604.14048), one function per equation, written as in the paper.
 
 A triplet is a reference token p and a query token q of two kept views and an anchor k of a held-out view, each of C
 channels. The teacher has seen all N views, the student only the kept ones; p', q' and f' (here `teacher_p` ...) are
@@ -28,13 +28,13 @@ def huber(x: Tensor, delta: float) -> Tensor:
 
 def cosine(a: Tensor, b: Tensor) -> Tensor:
     """cos(a, b) over the last axis; a vector of length zero gives 0 and takes no gradient."""
-    # Dividing by an infinite length makes 0 of the value and of its gradient; one by one, or inf * inf would give nan.
+    # An infinite length makes the value and its gradient 0; one division per length, as their product would give nan.
     length_a, length_b = (torch.where((x == 0).all(-1), torch.inf, x.square().sum(-1)).sqrt() for x in (a, b))
     return (a * b).sum(-1) / length_a / length_b
 
 
 def log_pi(a: Tensor, b: Tensor, temperature: float) -> Tensor:
-    """The logarithm of pi(a, b): its smallest values would be 0 themselves, and KL needs their logarithms."""
+    """The logarithm of pi(a, b), which KL needs also where pi itself would underflow to 0."""
     return torch.log_softmax((a - b) / temperature, dim=-1)
 
 

@@ -1,8 +1,8 @@
 """How the losses compute: in float32 or wider, with exact matrix products, over blocks that fit in cache.
 
-Features may arrive in half precision under autocast. Losses are differences of nearly equal numbers, whose digits half
-precision and TF32 do not have, so every loss widens its inputs and switches both off for its products. They are a
-small share of a step.
+Features may arrive in half precision under autocast. Losses are differences of nearly equal numbers, for which half
+precision and TF32 are too coarse, so every loss widens its inputs and switches both off for its products. The losses
+are a small share of a step.
 """
 
 from collections.abc import Generator, Iterator
@@ -39,7 +39,7 @@ def exact_matmul(tensor: Tensor) -> Generator[None]:
     """Matrix products on the device of `tensor` in the full precision of their inputs: no autocast, no TF32.
 
     A KL value is a small difference of large logarithms, and the rule for sides of length zero (`angles`) assumes the
-    rounding of the inputs' type. TF32 is a global setting; the one found is put back on the way out.
+    rounding of the inputs' type. TF32 is a global setting; its previous value is restored afterwards.
     """
     with torch.autocast(device_type=tensor.device.type, enabled=False):
         if tensor.device.type != "cuda":

@@ -1,7 +1,7 @@
 """Which tokens take part: those of the intra loss, random references and queries, anchors by similarity.
 
-Draws are separate from the loss: they can be made in advance from the seed of a run, kept beside a teacher cache, or be
-replaced by recorded indices. One draw is shared by the samples of a batch (docs/method.md, "Token draws").
+Draws are separate from the loss: they can be made in advance from the seed of a run or replaced by recorded indices.
+One draw is shared by the samples of a batch (docs/method.md, "Token draws").
 """
 
 from collections.abc import Sequence

@@ -25,9 +25,9 @@ class Line:
     variant: str
     views: int
     paper: Mapping[str, Any] = field(default_factory=dict)
-    """Fields of the row in the published table that it stands beside; empty: none does."""
+    """Fields that identify the row of the published table to compare with; empty: there is none."""
     compare_with: str | None = None
-    """Label of the row whose difference is tested."""
+    """Label of the row of this table that the difference is tested against."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ class Experiment:
     """Key of the published table."""
     layout: Layout = "means"
     """`means` over scenes and seeds; `changes`: relative ones in percent of the second line of each pair; `costs`;
-    `gain`: frozen, adapted and what the held-out views are worth, in one row per metric."""
+    `gain`: frozen, adapted, and the gain as a share of the 8->4 gap, in one row per metric."""
     rule: FrameRule | None = None
     """Frame rule that belongs to the table; None: the run's."""
     seeds: tuple[int, ...] = PAPER_SEEDS
@@ -279,10 +279,10 @@ def chosen(names: Sequence[str]) -> list[Experiment]:
 
 
 def datasets_of(entry: Experiment, asked: Sequence[str]) -> list[str]:
-    """The datasets among those asked for that an experiment is run on.
+    """The datasets of `asked` that an experiment is run on.
 
-    Ablations run on the dataset of the paper and, of the generated rooms, on one split; where none of these was asked
-    for, on what was asked for.
+    Ablations run on the dataset of the paper and, of the generated rooms, on one split; if `asked` has none of these,
+    on all of `asked`.
     """
     own = [
         name

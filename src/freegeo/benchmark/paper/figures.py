@@ -168,7 +168,7 @@ def cloud_figure(panels: Sequence[CloudPanel], truth: np.ndarray, threshold: flo
 
 
 def save_figure(figure: Figure, stem: Path) -> list[Path]:
-    """Write a figure as `<stem>.png` and `<stem>.pdf` and forget it."""
+    """Write a figure as `<stem>.png` and `<stem>.pdf` and close it."""
     paths = [stem.with_name(f"{stem.name}.{ending}") for ending in ("png", "pdf")]
     for path in paths:
         with atomic_path(path) as part:

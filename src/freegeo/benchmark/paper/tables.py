@@ -58,7 +58,7 @@ def experiment_tables(
 
     Args:
         entry: the experiment.
-        rows: the tidy table; rows that belong to others are left aside.
+        rows: the tidy table; rows of other experiments are ignored.
         rule: frame rule of the run, where the experiment has none of its own.
         family: `da3` or `vggt` when the model is of that published family, else None.
     """
@@ -107,7 +107,7 @@ def published_table(entry: Experiment, table: PaperTable) -> Table:
 
 
 def change_table(entry: Experiment, picked: Selection, datasets: Sequence[str]) -> Table:
-    """Relative changes in percent, averaged over datasets in the two ways that the words allow."""
+    """Relative changes in percent over datasets: the mean of the changes, and the change of the means."""
     metrics = tuple(dict.fromkeys(metric for dataset in datasets for metric in metrics_of(entry, dataset)))
     rows = []
     for line, base in compared_lines(entry):
@@ -146,7 +146,7 @@ def change_of_means(pairs: Sequence[tuple[float, float]]) -> float | None:
 
 
 def difference_table(entry: Experiment, picked: Selection, datasets: Sequence[str]) -> Table:
-    """Paired differences with 95 % intervals; `better` or `worse` where the interval leaves out zero."""
+    """Paired differences with 95 % intervals; `better` or `worse` where the interval excludes zero."""
     rows = []
     for dataset in datasets:
         for line, base in compared_lines(entry):
@@ -219,7 +219,7 @@ def compared_lines(entry: Experiment) -> list[tuple[Line, Line]]:
 
 
 def verdict(metric: str, interval: Interval, scenes: int) -> str:
-    """What an interval says; one from fewer than 5 scenes says nothing."""
+    """`better`, `worse`, or `open` where the interval includes zero; `too few scenes` below 5."""
     if scenes < FEWEST_SCENES:
         return "too few scenes"
     if not interval.excludes_zero:

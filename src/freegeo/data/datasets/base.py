@@ -1,4 +1,4 @@
-"""What a dataset of the benchmark has to say about itself, and helpers that its loader may use."""
+"""The description of a benchmark dataset, and helpers that its loader may use."""
 
 from __future__ import annotations
 
@@ -62,15 +62,15 @@ class Dataset:
     """(path, size of the photo): a depth file of `SceneTruth.depth`, (H, W) float32 metres, 0 or infinity where there
     is none. None: no depth files; a scene may carry its depth in memory."""
     valid_mask: Callable[[SceneTruth, int, tuple[int, int]], np.ndarray | None] | None = None
-    """(truth, frame, fusion size): pixels of the frame that may be fused, (H, W) bool, or None where nothing says so.
+    """(truth, frame, fusion size): pixels of the frame that may be fused, (H, W) bool, or None without any restriction.
     None: no frame has such a mask."""
     depth_of_every_frame: bool = True
     """Whether a frame without a depth file is a gap in the data."""
     recipe_row: str | None = None
-    """Row of the per-dataset settings of adaptation (`freegeo.adaptation.recipe`). None: nobody has published any, and
-    those of generated rooms are used."""
+    """Row of the per-dataset settings of adaptation (`freegeo.adaptation.recipe`). None: none are published, and those
+    of generated rooms are used."""
     archive_gb: float | None = None
-    """Size of the dataset's archive on the hub; None: it is not there."""
+    """Size of the dataset's archive on the hub; None: it is not on the hub."""
     generated: bool = False
     """Whether scenes are rendered when they are first used, so that nothing can be missing."""
 

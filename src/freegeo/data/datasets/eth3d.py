@@ -8,7 +8,7 @@
                masks_for_images/dslr_images/DSC_xxxx.png  8-bit, 1 marks occlusion, optional
 ```
 
-Frames come in the order of images.txt. The lens distortion of the raw JPEGs is set aside, as published. Source:
+Frames come in the order of images.txt. The lens distortion of the raw JPEGs is ignored, as published. Source:
 docs/benchmark.md, "Files of a scene".
 """
 

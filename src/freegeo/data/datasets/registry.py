@@ -53,7 +53,7 @@ def load_scene(data: Path, dataset: str, scene: str) -> Scene:
 
 
 def valid_mask(truth: SceneTruth, index: int, size_hw: tuple[int, int]) -> np.ndarray | None:
-    """Return the pixels of one frame that may be fused, (H, W) bool at fusion size; None where nothing says so."""
+    """Return the pixels of one frame that may be fused, (H, W) bool at fusion size; None without any restriction."""
     mask = get_dataset(truth.dataset).valid_mask
     return None if mask is None else mask(truth, index, size_hw)
 
@@ -61,8 +61,8 @@ def valid_mask(truth: SceneTruth, index: int, size_hw: tuple[int, int]) -> np.nd
 def true_depth(scene: Scene, size_hw: tuple[int, int]) -> Tensor | None:
     """Ground-truth depth of all frames at one size, nearest pixel: (S, h, w) float32 metres, 0 where nothing is known.
 
-    What the dataset masks counts as unknown. None when no frame of the scene has a depth. For 7-Scenes the depth camera
-    is not registered to the photos, so there errors near edges mean little.
+    Pixels that the dataset masks count as unknown. None when no frame of the scene has a depth. The depth camera of
+    7-Scenes is not registered to the photos, so its errors near edges mean little.
     """
     if scene.depth_z is not None:
         return resize_nearest(scene.depth_z, size_hw)

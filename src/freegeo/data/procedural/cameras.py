@@ -55,7 +55,7 @@ def camera_poses(
     pitch = torch.where(is_arc[:, None], arc_pitch, walk_pitch) + _around(jitter[..., 2], math.radians(2.0))
     roll = _around(jitter[..., 3], math.radians(3.0))
     position = position + torch.cat([_around(jitter[..., 4:6], 0.02), _around(jitter[..., 6:7], 0.05)], dim=-1)
-    # Jitter and ellipses stay inside by construction; the clamp is what makes it a guarantee.
+    # Jitter and ellipses stay inside by construction; the clamp guarantees it.
     limit = half_extent_m[:, None, :2] - 0.75 * WALL_MARGIN_M
     position = torch.cat([torch.clamp(position[..., :2], -limit, limit), position[..., 2:]], dim=-1)
     return _look(position, yaw, pitch, roll), is_arc
@@ -100,7 +100,7 @@ def _walk(
     angle = 2.0 * math.pi * trajectory[:, 5]
     angles = [angle]
     for frame in range(1, frames):
-        # Half a step ahead the ellipse's speed stands for the whole step.
+        # Midpoint rule: the ellipse's speed half a step ahead is used for the whole step.
         middle = angle + 0.5 * stride / _ellipse_speed(axes, angle)
         angle = angle + stride * _between(jitter[:, frame, 7], 0.95, 1.05) / _ellipse_speed(axes, middle)
         angles.append(angle)

@@ -1,12 +1,12 @@
 """The domains of generated rooms: one literal table.
 
 Source: docs/embedded-model.md, "How the rooms are made". Every domain owns a range of room seeds that no other domain
-touches. A validation domain has its counterpart's appearance and texture bank and its own seeds, so that learning rates
-and numbers of steps are never chosen on rooms that are scored. Rooms that are scored are photographed with one lens
-from the middle of the training range: at 64 pixels a small model does not learn to tell lenses apart, and wrong
-intrinsics would cap every surface score. The domain `lens` keeps the range of lenses, so that what this costs stays
-visible. `sparse` has photos half as far again from one to the next: every second of them, what a student sees, turns by
-48 degrees on average instead of 32, with a lens of 65.
+uses. A validation domain has its counterpart's appearance and texture bank and its own seeds, so that learning rates
+and numbers of steps are never chosen on rooms that are scored. Rooms that are scored are photographed with one field of
+view from the middle of the training range: at 64 pixels a small model does not learn to tell lenses apart, and wrong
+intrinsics would limit every surface score. The domain `lens` keeps the range of fields of view, which measures that
+limit. In `sparse` the camera moves and turns 1.5 times as far between photos: from one of the student's views (every
+second photo) to the next it turns by 48 degrees on average instead of 32, with a field of view of 65.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ class Domain:
     half_extent_m: Range = (2.2, 3.5)
     """Half the width and half the depth of the room."""
     field_of_view_deg: Range = (58.0, 72.0)
-    """Horizontal; one lens a room."""
+    """Horizontal; one value per room."""
     pace: float = 1.0
     """Factor on how far the camera turns and moves from one view to the next."""
     ambient: Range = (0.4, 0.62)
     """Share of the light that does not come from the lamp."""
     exposure: float = 1.0
-    """Factor on all light: in a dim room a camera exposes longer, and black views would say nothing."""
+    """Factor on all light, like a longer exposure in a dim room, whose views would else be nearly black."""
     contrast: Range = (1.0, 1.0)
     """How far the second and third colour of a surface are from its first one: 0 makes the surface uniform."""
     saturation: float = 1.0

@@ -1,4 +1,4 @@
-"""Rooms as a user would meet them: photographs at photo size, with exact cameras and depth."""
+"""Generated rooms as scenes with photos at photo size, exact cameras and exact depth."""
 
 from __future__ import annotations
 

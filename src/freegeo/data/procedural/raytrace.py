@@ -26,7 +26,7 @@ from freegeo.errors import UserError
 
 LAMP_GAIN = 0.95
 LAMP_REACH_M = 5.0
-"""Distance at which the lamp's light has fallen to half."""
+"""Distance in metres at which the lamp's light has fallen to half."""
 GRAIN_CELLS = 96
 """Image noise has this many cells across the width whatever the resolution, so shrinking a photo keeps it."""
 

@@ -1,4 +1,4 @@
-"""Sampling of generated rooms: what stands where, what it looks like, who looks at it.
+"""Sampling of generated rooms: primitives, materials, light and cameras.
 
 A room is a box of six faces with five yaw-rotated boxes, two spheres and two capped cylinders. Each room's numbers come
 from its own seed, never from its neighbours in a batch. Source: docs/embedded-model.md, "How the rooms are made".
@@ -226,7 +226,7 @@ def _materials(seeds: Sequence[int], domain: Domain) -> dict[str, Tensor]:
 
 
 def _light(seeds: Sequence[int], domain: Domain, half_extent: Tensor) -> dict[str, Tensor]:
-    """Lamp, ambient share and the way the camera records it."""
+    """Lamp, ambient share, and the gamma and colour cast of the camera."""
     numbers = _uniform(seeds, 4, _LIGHT_NUMBERS)
     lamp_ground = (2.0 * numbers[:, :2] - 1.0) * 0.6 * half_extent[:, :2]
     lamp_height = half_extent[:, 2:] * (0.72 + 0.2 * numbers[:, 2:3])
