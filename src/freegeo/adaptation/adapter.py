@@ -63,7 +63,7 @@ class PackedDropout(nn.Module):
         words = torch.empty((x.numel() + 3) // 4, dtype=torch.int64).random_(-(1 << 63), None)
         drawn = words.view(torch.int16)[: x.numel()].view(x.shape)
         keep = drawn >= self.dropped - self.STEPS // 2
-        return x * keep * (self.STEPS / (self.STEPS - self.dropped))
+        return (x * keep).mul_(self.STEPS / (self.STEPS - self.dropped))
 
 
 class Adapter:
