@@ -13,6 +13,7 @@ import freegeo
 from freegeo import pipeline
 from freegeo.adaptation.adapter import Adapter, is_adapted
 from freegeo.adaptation.recipe import PAPER
+from freegeo.adaptation.state import UNFINISHED_FILE
 from freegeo.errors import UserError
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.models import api
@@ -242,7 +243,7 @@ def test_a_run_that_was_stopped_continues(model, tmp_path, monkeypatch):
     assert same(tensors(whole), tensors(rest))
     rest.save(str(tmp_path))
     assert (tmp_path / "freegeo.json").is_file()
-    assert not (tmp_path / adapting.UNFINISHED_FILE).exists()
+    assert not (tmp_path / UNFINISHED_FILE).exists()
 
 
 def test_nothing_is_shown_unless_it_is_asked_for(model, monkeypatch):

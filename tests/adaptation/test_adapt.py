@@ -19,6 +19,7 @@ from freegeo.adaptation.losses import adaptation_loss, draw_tokens, feature_dist
 from freegeo.adaptation.memory import Plan
 from freegeo.adaptation.recipe import paper, released
 from freegeo.adaptation.samples import SceneImages, released_augmentation
+from freegeo.adaptation.state import UNFINISHED_FILE
 from freegeo.adaptation.views import schedule
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.models.precision import Compute
@@ -271,9 +272,9 @@ def test_a_saved_run_describes_itself_and_leaves_no_state(tmp_path, monkeypatch)
     monkeypatch.setattr(adapting, "SAVE_EVERY_S", -1.0)
     model = tiny_da3()
     result = run(model, [noise_scene(8)], quick(model, steps=2), resume_in=tmp_path)
-    assert (tmp_path / adapting.UNFINISHED_FILE).is_file()
+    assert (tmp_path / UNFINISHED_FILE).is_file()
     result.save(tmp_path)
-    assert not (tmp_path / adapting.UNFINISHED_FILE).exists()
+    assert not (tmp_path / UNFINISHED_FILE).exists()
     about = json.loads((tmp_path / "freegeo.json").read_text())
     assert about["recipe"]["loss"]["temperature"] == model.spec.adaptation.temperature
     assert len(about["loss_curve"]) == 2
@@ -465,7 +466,7 @@ def test_the_state_of_another_run_is_refused(changed, tmp_path, monkeypatch):
 
 
 def test_a_damaged_state_is_refused(tmp_path):
-    (tmp_path / adapting.UNFINISHED_FILE).write_bytes(b"no tensors")
+    (tmp_path / UNFINISHED_FILE).write_bytes(b"no tensors")
     model = tiny_da3()
     with pytest.raises(UserError, match="damaged state"):
         run(model, [noise_scene(9)], quick(model), resume_in=tmp_path)

@@ -200,6 +200,13 @@ def test_a_job_that_fits_nowhere_is_refused_with_its_need(monkeypatch):
         eth3d(14.7)
 
 
+def test_the_disk_is_looked_at_where_the_files_will_be(tmp_path, monkeypatch):
+    asked, model = [], tiny_da3()
+    monkeypatch.setattr(memory.shutil, "disk_usage", lambda path: asked.append(path) or SimpleNamespace(free=GB))
+    adapt(model, [images(9, 32)], scene(model.spec).changed(steps=1), seed=0, resume_in=tmp_path / "not" / "yet")
+    assert asked == [tmp_path]
+
+
 def test_the_plan_is_logged_with_its_parts(caplog, monkeypatch):
     monkeypatch.setattr(memory.shutil, "disk_usage", lambda path: SimpleNamespace(free=100 * GB))
     caplog.set_level("INFO")

@@ -15,7 +15,7 @@ from safetensors.numpy import load_file
 
 from cli.conftest import PHOTOS, QUICK
 from freegeo.adaptation import adapt as adapting
-from freegeo.adaptation.adapt import UNFINISHED_FILE
+from freegeo.adaptation.state import UNFINISHED_FILE
 from freegeo.export import formats
 from freegeo.files import LEDGER_FILE, LOCK_FILE, RUN_FILE
 

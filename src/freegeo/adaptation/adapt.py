@@ -1,6 +1,7 @@
 """Adaptation: the paper's Algorithm 1 as a loop that can be stopped and continued at any step.
 
-Reading order: `adapt` (what a run is), `_train` (the loop), `_learn` (one view set), `_State` (what is saved).
+Reading order: `adapt` (what a run is), `_train` (the loop), `_learn` (one view set), `_State` (what changes
+from step to step; `state` writes it to disk).
 """
 
 from __future__ import annotations
@@ -25,17 +26,15 @@ from freegeo.adaptation.losses import adaptation_loss, feature_distance, require
 from freegeo.adaptation.memory import Plan, plan_adaptation
 from freegeo.adaptation.recipe import Recipe
 from freegeo.adaptation.samples import Sample, Samples, SceneImages, loss_features, step_draws
+from freegeo.adaptation.state import read_state, remove_state, write_state
 from freegeo.adaptation.views import Visit, schedule
-from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import write_tensors
+from freegeo.errors import FreeGeoError
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
 
 logger = logging.getLogger(__name__)
 
 SAVE_EVERY_S = 30.0
-UNFINISHED_FILE = "adapting.safetensors"
-"""State of an unfinished run."""
 CPU = Compute()
 
 
@@ -286,66 +285,29 @@ class _State:
         self.unread.clear()
 
     def save(self, next_step: int, *, seconds: float) -> None:
-        """Write the state of a run that continues at `next_step`; the file is replaced atomically."""
+        """Write the state of a run that continues at `next_step`."""
         assert self.run.folder is not None
         self.read_terms()
-        tensors = {}
-        for name, parameter in self.result.adapter.named_parameters().items():
-            tensors[name] = parameter
-            for key, value in self.optimiser.state[parameter].items():
-                tensors[f"{name}|{key}"] = value
         about = {
-            "identity": self._identity(),
-            "next_step": next_step,
-            "curve": self.result.curve,
-            "seconds": seconds,
+            "identity": self._identity(), "next_step": next_step, "curve": self.result.curve, "seconds": seconds,
             "scaler": self.scaler.state_dict(),
-        }
-        write_tensors(self.run.folder / UNFINISHED_FILE, tensors, {"run": json.dumps(about)})
+        }  # fmt: skip
+        write_state(self.run.folder, self.result.adapter, self.optimiser, about)
 
     def _restore(self) -> int:
         """Load the saved state, if there is one, and return the step to continue at."""
-        path = None if self.run.folder is None else self.run.folder / UNFINISHED_FILE
-        if path is None or not path.is_file():
+        if self.run.folder is None:
             return 0
-        about, tensors = _read_state(path)
-        if about.get("identity") != self._identity():
-            raise UserError(f"{path}: this state belongs to another run. Remove it, or choose another output folder.")
-        named = self.result.adapter.named_parameters()
-        self.result.adapter.load({name: tensors[name] for name in named})
-        for name, parameter in named.items():
-            # The fused optimiser needs its state, the step counter included, on the parameter's device.
-            self.optimiser.state[parameter] = {
-                key.partition("|")[2]: value.to(parameter.device)
-                for key, value in tensors.items()
-                if key.startswith(f"{name}|")
-            }
+        about = read_state(self.run.folder, self.result.adapter, self.optimiser, self._identity())
+        if about is None:
+            return 0
         self.scaler.load_state_dict(about["scaler"])
         self.result.curve, self.result.seconds = about["curve"], about["seconds"]
         return about["next_step"]
 
     def _identity(self) -> str:
         """Return a fingerprint of model name, scenes, recipe and seed; pixels and weights are left out."""
-        about = {
-            "model": self.run.model.spec.name,
-            "scenes": [(scene.name, scene.count) for scene in self.run.scenes],
-            "recipe": asdict(self.run.recipe),
-            "seed": self.run.seed,
-        }
+        scenes = [(scene.name, scene.count) for scene in self.run.scenes]
+        model, recipe = self.run.model.spec.name, asdict(self.run.recipe)
+        about = {"model": model, "scenes": scenes, "recipe": recipe, "seed": self.run.seed}
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _read_state(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {}).get("run", "{}"))
-            return about, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except SafetensorError as error:
-        raise UserError(f"{path}: damaged state of an unfinished run ({error}). Remove it to start again.") from None
-
-
-def remove_state(folder: Path) -> None:
-    """Remove the state of a run that is finished."""
-    (folder / UNFINISHED_FILE).unlink(missing_ok=True)

@@ -82,7 +82,8 @@ def plan_adaptation(
     """
     budget = available(compute.device) if budget is None else budget
     job = Footprint(model, scenes, recipe, steps, compute)
-    free_disk = shutil.disk_usage(folder or tempfile.gettempdir()).free
+    place = Path(tempfile.gettempdir()) if folder is None else folder.absolute()
+    free_disk = shutil.disk_usage(next(parent for parent in (place, *place.parents) if parent.exists())).free
     plans = [job.plan(place, checkpointing) for checkpointing in (False, True) for place in ("device", "disk")]
     for plan in plans:
         if plan.peak_bytes <= budget and (plan.place != "disk" or plan.kept_bytes < free_disk):

@@ -21,11 +21,12 @@ from typing import Any
 
 import torch
 
-from freegeo.adaptation.adapt import Adapted, Progress, adapt, remove_state
+from freegeo.adaptation.adapt import Adapted, Progress, adapt
 from freegeo.adaptation.adapter import Adapter, count_trainable
 from freegeo.adaptation.adapter_files import load_adapter, save_adapter
 from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
 from freegeo.adaptation.samples import SceneImages
+from freegeo.adaptation.state import remove_state
 from freegeo.adaptation.views import schedule
 from freegeo.benchmark.tasks import DAMAGED, Problem, reason_of
 from freegeo.data.datasets.registry import load_scene

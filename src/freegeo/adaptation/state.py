@@ -1,0 +1,63 @@
+"""The state of an unfinished run on disk: trained parameters, the optimiser's moments, and JSON-like facts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from freegeo.adaptation.adapter import Adapter
+from freegeo.errors import UserError
+from freegeo.files import write_tensors
+
+UNFINISHED_FILE = "adapting.safetensors"
+
+
+def write_state(folder: Path, adapter: Adapter, optimiser: torch.optim.Optimizer, about: Mapping[str, Any]) -> None:
+    """Write the state into a folder; the file is replaced atomically."""
+    tensors = {}
+    for name, parameter in adapter.named_parameters().items():
+        tensors[name] = parameter
+        for key, value in optimiser.state[parameter].items():
+            tensors[f"{name}|{key}"] = value
+    write_tensors(folder / UNFINISHED_FILE, tensors, {"run": json.dumps(about)})
+
+
+def read_state(
+    folder: Path, adapter: Adapter, optimiser: torch.optim.Optimizer, identity: str
+) -> dict[str, Any] | None:
+    """Load a saved state into the adapter and its optimiser and return the facts; None when there is no file.
+
+    UserError for a damaged file, and for the state of another run: one whose facts have another `identity`.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = folder / UNFINISHED_FILE
+    if not path.is_file():
+        return None
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = json.loads((file.metadata() or {}).get("run", "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise UserError(f"{path}: damaged state of an unfinished run ({error}). Remove it to start again.") from None
+    if about.get("identity") != identity:
+        raise UserError(f"{path}: this state belongs to another run. Remove it, or choose another output folder.")
+    named = adapter.named_parameters()
+    adapter.load({name: tensors[name] for name in named})
+    for name, parameter in named.items():
+        # The fused optimiser needs its state, the step counter included, on the parameter's device.
+        optimiser.state[parameter] = {
+            key.partition("|")[2]: value.to(parameter.device)
+            for key, value in tensors.items()
+            if key.startswith(f"{name}|")
+        }
+    return about
+
+
+def remove_state(folder: Path) -> None:
+    """Remove the state of a run that is finished."""
+    (folder / UNFINISHED_FILE).unlink(missing_ok=True)
