@@ -216,10 +216,17 @@ def test_the_plan_is_logged_with_its_parts(caplog, monkeypatch):
 
 
 def test_every_run_plans_with_what_is_free(monkeypatch):
-    monkeypatch.setattr(memory, "available", lambda device: 1_000_000)
+    monkeypatch.setattr(memory, "available", lambda device, model: 1_000_000)
     model = tiny_da3()
     with pytest.raises(UserError, match="GB are free"):
         adapt(model, [images(9, 32)], scene(model.spec), seed=0)
+
+
+def test_a_model_that_is_in_memory_already_is_not_counted_twice(monkeypatch):
+    monkeypatch.setattr(memory, "host_available", lambda: 1_000_000)
+    model = tiny_da3()
+    assert memory.available(CPU.device, model) == 800_000 + sum(p.nbytes for p in model.parameters())
+    assert memory.available(MPS, model) == 800_000
 
 
 def test_reconstruction_says_how_many_views_fit():

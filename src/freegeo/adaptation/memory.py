@@ -80,7 +80,7 @@ def plan_adaptation(
     The first image of every scene is loaded for its size. `budget` (bytes) None: what is free now; `folder` is where
     files of samples would be written. The model may be on the meta device. UserError when nothing fits.
     """
-    budget = available(compute.device) if budget is None else budget
+    budget = available(compute.device, model) if budget is None else budget
     job = Footprint(model, scenes, recipe, steps, compute)
     place = Path(tempfile.gettempdir()) if folder is None else folder.absolute()
     free_disk = shutil.disk_usage(next(parent for parent in (place, *place.parents) if parent.exists())).free
@@ -302,9 +302,7 @@ def plan_reconstruction(
     """
     shape, spec = shape_of(model), model.adaptable().spec
     resident = shape.parameters * WIDE
-    if budget is None:
-        placed = next(iter(model.parameters())).device.type == compute.device.type
-        budget = available(compute.device) + (resident if placed else 0)
+    budget = available(compute.device, model) if budget is None else budget
     pixels = math.prod(image_hw)
     per_view = (image_hw[0] // spec.patch_size) * (image_hw[1] // spec.patch_size) + shape.special
     maps = 2 * WIDE * pixels  # depth and confidence
@@ -345,14 +343,22 @@ def plan_reconstruction(
     return parts(views), fitting
 
 
-def available(device: torch.device) -> int:
-    """Bytes that a run may use on a device: what is free, less a reserve for what a plan does not count."""
+def available(device: torch.device, model: ReconstructionModel) -> int:
+    """Bytes that a run may use on a device, those of a model that is already there included.
+
+    8 % of a CUDA device and 20 % of main memory are left for what no plan counts.
+    """
     if device.type == "cuda":
-        return int(torch.cuda.mem_get_info(device)[0] * 0.92)
-    return int(_host_available() * 0.8)
+        # Blocks that PyTorch has reserved and does not use count as taken for the driver.
+        reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        free = int((torch.cuda.mem_get_info(device)[0] + reserved) * 0.92)
+    else:
+        free = int(host_available() * 0.8)
+    weights = sum(p.nbytes for p in model.parameters() if p.device.type == device.type)
+    return free + weights
 
 
-def _host_available() -> int:
+def host_available() -> int:
     """Bytes of main memory that are free or can be freed."""
     lines = Path("/proc/meminfo").read_text().splitlines() if Path("/proc/meminfo").is_file() else []
     for line in lines:
