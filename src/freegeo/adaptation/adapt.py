@@ -25,7 +25,7 @@ from freegeo.adaptation.adapter_files import save_adapter
 from freegeo.adaptation.losses import adaptation_loss, feature_distance, require_finite
 from freegeo.adaptation.memory import Plan, plan_adaptation
 from freegeo.adaptation.recipe import Recipe
-from freegeo.adaptation.samples import Sample, Samples, SceneImages, loss_features, step_draws
+from freegeo.adaptation.samples import STEP_SEED_STRIDE, Sample, Samples, SceneImages, loss_features, step_draws
 from freegeo.adaptation.state import read_state, remove_state, write_state
 from freegeo.adaptation.views import Visit, schedule
 from freegeo.errors import FreeGeoError
@@ -241,7 +241,7 @@ def _training(run: _Run, plan: Plan, step: int) -> Generator[None]:
     model.set_recompute(plan.checkpointing)
     try:
         with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-            torch.manual_seed(run.seed * 1_000_003 + step)
+            torch.manual_seed(run.seed * STEP_SEED_STRIDE + step)
             yield
     finally:
         model.eval()

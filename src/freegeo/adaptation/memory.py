@@ -14,6 +14,8 @@ import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
 from pathlib import Path
 
 import torch
@@ -84,14 +86,14 @@ def plan_adaptation(
     job = Footprint(model, scenes, recipe, steps, compute)
     place = Path(tempfile.gettempdir()) if folder is None else folder.absolute()
     free_disk = shutil.disk_usage(next(parent for parent in (place, *place.parents) if parent.exists())).free
-    plans = [job.plan(place, checkpointing) for checkpointing in (False, True) for place in ("device", "disk")]
-    for plan in plans:
+    for checkpointing, where in product((False, True), ("device", "disk")):
+        plan = job.plan(where, checkpointing)
         if plan.peak_bytes <= budget and (plan.place != "disk" or plan.kept_bytes < free_disk):
             logger.info("%s (%.1f GB are free)", plan.summary(), budget / 1e9)
             return plan
     raise UserError(
-        f"adapting {model.spec.name} needs {plans[-1].peak_bytes / 1e9:.1f} GB even with activation checkpointing (and "
-        f"{plans[-1].kept_bytes / 1e9:.1f} GB of disk), and {budget / 1e9:.1f} GB are free. Use smaller images, fewer "
+        f"adapting {model.spec.name} needs {plan.peak_bytes / 1e9:.1f} GB even with activation checkpointing (and "
+        f"{plan.kept_bytes / 1e9:.1f} GB of disk), and {budget / 1e9:.1f} GB are free. Use smaller images, fewer "
         "--views, --precision bf16 or a smaller model."
     )
 
@@ -119,7 +121,7 @@ class Footprint:
 
     def plan(self, place: Place, checkpointing: bool) -> Plan:
         """Predict what is on the device at the peak: in the teacher's pass, the student's or that of `hold`."""
-        kept = self._kept_peak()
+        kept = self._kept_peak
         sample = self._sample(self.largest)
         teacher, learning = self._teacher(sample), self._learning(checkpointing)
         resident = [("weights", self.shape.parameters * WIDE), ("adapter and optimiser", 4 * WIDE * self.trained)]
@@ -179,6 +181,7 @@ class Footprint:
         uses = Counter(key for view_set in sets for key in view_keys(view_set, self.recipe))
         return sum(self.shape.token_bytes(self.tokens[key[0]]) for key, count in uses.items() if count > 1)
 
+    @cached_property
     def _kept_peak(self) -> int:
         """Most bytes of samples kept at one time: each is kept from its first visit to its last."""
         left = Counter(sample_key(view_set, self.recipe) for view_set in self.visits)

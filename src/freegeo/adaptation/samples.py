@@ -41,7 +41,8 @@ from freegeo.types import Features, ImageBatch, PhotoLike, ViewTokens
 
 Place = Literal["device", "disk"]
 """Where samples are kept between visits: on the model's device, or in memory-mapped files."""
-DRAW_SEED_STRIDE = 1_000_003
+STEP_SEED_STRIDE = 1_000_003
+"""Distance of the seeds of two runs; between them lie the seeds of a run's steps."""
 SPREAD_HEADROOM = 2.0
 """Factor by which the student's spread of softmax inputs may exceed the teacher's, measured once per view set."""
 AHEAD = 2
@@ -52,7 +53,7 @@ AHEAD = 2
 class SceneImages:
     """The images of one scene; `load` returns the chosen ones as (S, 3, H, W) in [0, 1], all of one size.
 
-    `load` is called from a background thread, one call at a time.
+    `load` is called once for the first image, to plan memory, then from a background thread, one call at a time.
     """
 
     name: str
@@ -294,7 +295,7 @@ def step_draws(sample: Sample, visit: Visit, config: LossConfig, *, seed: int) -
         tokens_per_view=patch.shape[2] + (special.shape[2] if config.cross_tokens == "all" else 0),
         student_views=len(visit.view_set.kept),
         held_out_views=len(visit.view_set.frames) - len(visit.view_set.kept),
-        generator=torch.Generator().manual_seed(seed * DRAW_SEED_STRIDE + visit.step),
+        generator=torch.Generator().manual_seed(seed * STEP_SEED_STRIDE + visit.step),
     ).to(patch.device)
 
 
