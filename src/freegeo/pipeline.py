@@ -270,6 +270,8 @@ class Job:
     timings: dict[str, float] = field(default_factory=dict)
     command: str | None = None
     """The command line, for reconstruction.json."""
+    warnings: list[str] = field(default_factory=list)
+    """What makes the result doubtful, one sentence each, for reconstruction.json; may grow until that is written."""
     after: Callable[[Job], None] = lambda job: None
     """Called before the folder is marked as finished, to write more."""
     in_place: Adapter | None = None
@@ -341,6 +343,7 @@ class Job:
             "image_hw": list(final.image_hw),
             "adapter": ADAPTER_FOLDER if self.recipe else (str(self.adapter) if self.adapter else None),
             "frozen_prediction": f"{FROZEN_FOLDER}/{PREDICTION_NAME}" if frozen is not None else None,
+            "warnings": list(self.warnings),
             "loss": self._loss_change(),
             "filters": None if report is None else {"pixels": report.pixels, "removed": dict(report.removed)},
             "recipe": self.folder.settings.get("recipe"),

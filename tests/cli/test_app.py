@@ -39,7 +39,17 @@ def test_verbose_shows_what_the_library_notes_down():
     for verbose, level in ((False, logging.INFO), (True, logging.DEBUG)):
         console.configure_logging(verbose)
         assert logging.getLogger("freegeo").getEffectiveLevel() == level
-        assert len(logging.getLogger("freegeo").handlers) == 1
+
+
+def test_a_warning_is_shown_and_kept_once_until_the_next_command(capsys):
+    for _ in range(2):
+        console.configure_logging(False)
+        assert console.warned() == []
+        for _ in range(2):
+            logging.getLogger("freegeo.data").warning("Half of %s is cut off.", "a.png")
+        logging.getLogger("freegeo.data").info("a note")
+        assert console.warned() == ["Half of a.png is cut off."]
+    assert capsys.readouterr().err.splitlines()[0] == "warning: Half of a.png is cut off."
 
 
 @pytest.mark.parametrize("flag", ["-v", "--verbose"])

@@ -44,6 +44,16 @@ def test_names_and_texts_are_escaped(example):
     assert "freegeo run &#39;my photos&#39; -o out" in example
 
 
+def test_warnings_of_the_summary_stand_at_the_top(tmp_path):
+    folder = write_example(tmp_path / "out")
+    plain = write_report(folder).read_text(encoding="utf-8")
+    summary = files.read_json(folder / "reconstruction.json")
+    files.write_json(folder / "reconstruction.json", {**summary, "warnings": ["Half of <b>a.png</b> is cut off."]})
+    page = write_report(folder).read_text(encoding="utf-8")
+    assert 'class="warnings"' not in plain
+    assert page.index("Half of &lt;b&gt;a.png&lt;/b&gt; is cut off.") < page.index("<main>")
+
+
 def test_everything_asked_for_is_there(example):
     for part in (
         "scene", "photos", "truth", "plan", "loss", "filters", "details", "canvas3d", "stage3d", "conf3d", "size3d",

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 _typed: list[str] = []
+_warned: list[str] = []
 
 
 def configure_logging(verbose: bool) -> None:
@@ -18,14 +19,42 @@ def configure_logging(verbose: bool) -> None:
     logger = logging.getLogger("freegeo")
     logger.handlers.clear()
     handler = logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("%(message)s"))
+    handler.setFormatter(_Formatter())
     logger.addHandler(handler)
+    logger.addHandler(_Remembering(logging.WARNING))
+    _warned.clear()
     logger.setLevel(logging.DEBUG if verbose else logging.INFO)
     logger.propagate = False
     warnings.showwarning = _show_warning  # ty: ignore[invalid-assignment]
     if not verbose:
         # Pillow warns of odd metadata in files that it can read nevertheless.
         warnings.filterwarnings("ignore", category=UserWarning, module="PIL")
+
+
+class _Formatter(logging.Formatter):
+    """Messages as they are; warnings say that they are warnings."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        text = super().format(record)
+        return f"warning: {text}" if record.levelno >= logging.WARNING else text
+
+
+class _Remembering(logging.Handler):
+    """Keep warnings, each once, for the summary and the report."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        sentence = record.getMessage()
+        if sentence not in _warned:
+            _warned.append(sentence)
+
+
+def warned() -> list[str]:
+    """Return the warnings of this command so far: the list itself, which later warnings are added to.
+
+    Any module warns of a doubtful result with `logging.getLogger(__name__).warning`, in one sentence; the log, the
+    summary (`reconstruction.json`) and the report show it.
+    """
+    return _warned
 
 
 def _show_warning(

@@ -86,8 +86,9 @@ def run_job(
         job = Job(
             model=model, batch=batch, folder=folder, recipe=recipe, adapter=adapter, seed=model_options.seed,
             compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
-            command=console.command_line(), after=after, formats=files.formats, filters=files.filters.settings(),
-            masks=masks, scene=None if recipe is None else scene_images("photos", photos, model, recipe, batch),
+            command=console.command_line(), warnings=console.warned(), after=after, formats=files.formats,
+            filters=files.filters.settings(), masks=masks,
+            scene=None if recipe is None else scene_images("photos", photos, model, recipe, batch),
         )  # fmt: skip
         describe(job.run(), output.output)
 
@@ -127,4 +128,6 @@ def describe(summary: dict[str, Any], folder: Path) -> None:
         console.say(f"adaptation loss {first:.4f} -> {last:.4f} (means of the first and last tenth of the steps)")
     console.say("seconds: " + ", ".join(f"{name} {value:.1f}" for name, value in summary["seconds"].items()))
     console.say(f"licence of the weights: {summary['licence_of_weights']}")
+    for sentence in summary["warnings"]:
+        console.say(f"warning: {sentence}")
     console.written(folder, FILES)

@@ -67,6 +67,7 @@ def render(result: Result) -> str:
     return environment.get_template(TEMPLATE).render(
         title=result.folder.resolve().name,
         facts=facts(result),
+        warnings=list(result.summary.get("warnings") or []),
         stages=[{"key": s.key, "label": s.label} for s in result.stages.values()],
         predictions=[{"key": s.key, "label": s.label} for s in result.predictions],
         scene=scene_data(result) if result.has_cameras else None,
