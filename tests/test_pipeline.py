@@ -3,6 +3,7 @@
 import io
 import logging
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from freegeo import pipeline
 from freegeo.adaptation.adapter import Adapter, is_adapted
 from freegeo.adaptation.recipe import PAPER
 from freegeo.adaptation.state import UNFINISHED_FILE
-from freegeo.errors import UserError
+from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.models import api
 from tiny_models import noise, quick, same, tensors, tiny_da3, trained
@@ -106,7 +107,7 @@ def test_the_model_is_as_before_when_something_fails(model, saved):
         assert unchanged(model, before)
 
 
-def test_an_adapter_looks_from_the_first_view(model, saved, monkeypatch):
+def test_results_with_and_without_an_adapter_have_the_same_reference_view(model, saved, monkeypatch):
     asked = []
     plain = model.aggregate
     monkeypatch.setattr(
@@ -120,7 +121,37 @@ def test_an_adapter_looks_from_the_first_view(model, saved, monkeypatch):
     freegeo.reconstruct(model, pictures())
     with adapter.off():
         freegeo.reconstruct(model, pictures())
-    assert asked == ["middle", "first", "saddle_balanced", "first", "middle"]
+    assert asked == ["middle", "middle", "saddle_balanced", "middle", "middle"]
+
+
+@pytest.mark.parametrize("broken", ["depth_z", "T_cam_world", "K"])
+def test_an_answer_that_is_no_number_is_a_failure_of_the_model(model, monkeypatch, broken):
+    plain = model.decode
+
+    def decode(features, **options):
+        found = plain(features, **options)
+        value = getattr(found, broken).clone()
+        value[:, 1] = float("nan")
+        return replace(found, **{broken: value})
+
+    monkeypatch.setattr(model, "decode", decode)
+    with pytest.raises(FreeGeoError, match=rf"not a finite number for 1 of {VIEWS} views.*--precision fp32"):
+        freegeo.reconstruct(model, pictures())
+
+
+def test_a_few_values_that_are_no_numbers_are_no_failure(model, monkeypatch):
+    plain = model.decode
+
+    def decode(features, **options):
+        found = plain(features, **options)
+        depth_z = found.depth_z.clone()
+        depth_z[..., 0, 0] = float("inf")
+        return replace(found, depth_z=depth_z)
+
+    monkeypatch.setattr(model, "decode", decode)
+    result = freegeo.reconstruct(model, pictures())
+    assert np.isinf(result.depth_z[:, 0, 0]).all()
+    assert np.isfinite(result.depth_z[:, 1:]).all()
 
 
 def test_adapters_that_cannot_be_used(model, saved, tmp_path):
@@ -291,10 +322,3 @@ def test_results_are_stored_and_opened(model, tmp_path):
     assert opened.names == found.names
     with pytest.raises(UserError, match="holds no reconstruction"):
         freegeo.open_reconstruction(tmp_path / "nowhere")
-
-
-def test_settings_spell_the_recipe_out(model):
-    settings = pipeline.settings_of(quick(model), command="run")
-    assert settings["command"] == "run"
-    assert settings["recipe"]["steps"] == 4
-    assert pipeline.settings_of(None)["recipe"] is None

@@ -12,7 +12,7 @@ import pytest
 from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import LEDGER_FILE, LOCK_FILE, RUN_FILE, write_json
-from freegeo.run_folder import check_folder, difference, locked, run_folder
+from freegeo.run_folder import Part, check_folder, difference, locked, run_folder
 
 SETTINGS = {"model": "tiny", "recipe": {"steps": 2, "keep": (0, 2)}, "seed": 1}
 HIDDEN = {RUN_FILE, LOCK_FILE, LEDGER_FILE}
@@ -183,6 +183,81 @@ def test_result_inside_another_result_is_a_result_of_its_own(tmp_path):
         assert visible(tmp_path) == {"inner/result.json", "inner/deep/part.json"} | {
             f"inner/{name}" for name in (RUN_FILE, LEDGER_FILE)
         }
+
+
+PARTS = (
+    Part("train", ("adapter/",)),
+    Part("predict", ("prediction.npz",)),
+    Part("filter", ("",), free=True),
+    Part("formats", (), free=True),
+)
+STAGED = {
+    "command": "run",
+    "train": {"lr": 1},
+    "predict": {"rule": "first"},
+    "filter": {"share": 0.4},
+    "formats": ["a"],
+}
+STAGED_FILES = {"adapter/weights", "prediction.npz", "adapter.txt", "points.ply", "frozen/points.ply"}
+
+
+def staged(folder: Path, *, finish: bool = True) -> None:
+    with run_folder(folder, STAGED, parts=PARTS) as run:
+        for name in STAGED_FILES:
+            write_json(run / name, name)
+        run.note("train", 5)
+        run.note("predict", 6)
+        if finish:
+            run.finish()
+
+
+@pytest.mark.parametrize("finish", [False, True])
+@pytest.mark.parametrize(
+    ("part", "value", "kept"),
+    [
+        ("filter", {"share": 0.1}, {"adapter/weights", "prediction.npz"}),
+        ("formats", ["a", "b"], STAGED_FILES),
+    ],
+)
+def test_a_free_part_may_change_and_only_what_depends_on_it_goes(tmp_path, part, value, kept, finish):
+    staged(tmp_path, finish=finish)
+    (tmp_path / "notes.txt").write_text("mine")
+    changed = {**STAGED, part: value}
+    with run_folder(tmp_path, changed, parts=PARTS) as run:
+        assert not run.finished
+        assert visible(tmp_path) == kept | {"notes.txt"}
+        assert run.notes == {"train": 5, "predict": 6}
+        run.finish()
+    with run_folder(tmp_path, changed, parts=PARTS) as run:
+        assert run.finished
+    # What was kept is still freegeo's own.
+    with run_folder(tmp_path, {"command": "other"}, parts=PARTS, overwrite=True):
+        assert visible(tmp_path) == {"notes.txt"}
+
+
+def test_other_parts_need_overwrite_which_removes_what_depends_on_them(tmp_path):
+    staged(tmp_path)
+    changed = {**STAGED, "predict": {"rule": "middle"}, "filter": {"share": 0.1}}
+    with pytest.raises(UserError, match='--reference: "first" there, "middle" now'):
+        check_folder(tmp_path, changed, overwrite=False, parts=PARTS, labels={"rule": "--reference"})
+    assert visible(tmp_path) == STAGED_FILES
+    with run_folder(tmp_path, changed, parts=PARTS, overwrite=True) as run:
+        assert visible(tmp_path) == {"adapter/weights"}
+        assert run.notes == {"train": 5}
+
+
+@pytest.mark.parametrize("change", [{}, {"command": "reconstruct"}, {"train": {"lr": 2}}, {"room": 3}])
+def test_overwrite_starts_anew_when_the_first_part_or_nothing_differs(tmp_path, change):
+    staged(tmp_path)
+    with run_folder(tmp_path, {**STAGED, **change}, parts=PARTS, overwrite=True) as run:
+        assert visible(tmp_path) == set()
+        assert run.notes == {}
+
+
+def test_labels_stand_for_names_of_settings():
+    before, now = {"x": {"seed": 1, "contents": "abc"}, "y": {"contents": "a"}}, {"x": {"seed": 2}, "y": {}}
+    labels = {"seed": "--seed", "contents": "other photos"}
+    assert difference(before, now, labels) == "other photos; --seed: 1 there, 2 now"
 
 
 def test_ledger_never_leads_out_of_the_folder(tmp_path):

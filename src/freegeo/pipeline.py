@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import platform
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,33 +20,44 @@ from freegeo.adaptation import adapter_files
 from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapt import Adapted, Progress, loss_change
 from freegeo.adaptation.adapt import adapt as train_adapter
-from freegeo.adaptation.adapter import Adapter, is_adapted
+from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.adapter_files import METADATA
 from freegeo.adaptation.memory import plan_reconstruction
 from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Recipe
 from freegeo.adaptation.samples import SceneImages
 from freegeo.data.photos import MAX_VIEWS, load_photos
-from freegeo.errors import UserError
+from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.base import DEFAULT_FORMATS
 from freegeo.export.formats import export, filter_reconstruction
+from freegeo.export.kept import Filtered, save_kept
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import FILE_NAME as PREDICTION_NAME
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.files import FORMAT, read_json, write_json
+from freegeo.files import FORMAT, as_json, read_json, write_json
 from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.precision import Compute
+from freegeo.models.spec import ModelSpec
 from freegeo.progress import step_bar
 from freegeo.report.page import write_report
-from freegeo.run_folder import RunFolder
+from freegeo.run_folder import Part, RunFolder
 from freegeo.types import ImageBatch, PhotoLike
 
 if TYPE_CHECKING:
     from freegeo.data.photos import PhotoSource
 
+logger = logging.getLogger(__name__)
+
 SUMMARY_NAME = "reconstruction.json"
-FROZEN_FOLDER, ADAPTER_FOLDER = "frozen", "adapter"
+FROZEN_FOLDER, ADAPTER_FOLDER, FRAMES_FOLDER = "frozen", "adapter", "images"
+FILES_STAGE = "points and files"
+ADAPTATION = Part("adaptation", (f"{ADAPTER_FOLDER}/",))
+PREDICTION = Part("prediction", (f"{FROZEN_FOLDER}/{PREDICTION_NAME}", PREDICTION_NAME, f"{FRAMES_FOLDER}/"))
+FILTERS = Part("filters", ("",), free=True)
+FORMATS = Part("formats", (), free=True)
+PARTS = (ADAPTATION, PREDICTION, FILTERS, FORMATS)
+"""Parts of a job's settings: photos, model and adapter; how they are used; which pixels become points; which files."""
 CPU = Compute()
 
 
@@ -54,16 +67,37 @@ def predict(
 ) -> Reconstruction:
     """Reconstruct prepared images with the model and the adapter that is on, if any.
 
-    `reference` None is the first view when an adapter is on, as in adaptation, else the model's own rule. UserError
-    when the images do not fit into memory together.
+    `reference` None is the model's own rule, with and without an adapter: results before and after adaptation differ in
+    nothing else. UserError when the images do not fit into memory together, FreeGeoError when the model answers with
+    values that are not finite.
     """
-    reference = reference or ("first" if is_adapted(model) else model.spec.reference)
+    result = _predict(model, batch, reference=reference, compute=compute)
+    trouble = not_finite(result)
+    if trouble:
+        raise FreeGeoError(f"{trouble} Try --precision fp32, and check the weights.")
+    return result
+
+
+def _predict(
+    model: ReconstructionModel, batch: ImageBatch, *, reference: str | None, compute: Compute
+) -> Reconstruction:
     plan_reconstruction(model, len(batch), batch.image_hw, compute=compute)
     model.to(compute.device).eval()
     with compute.autocast():
         tokens = embed_in_chunks(model, batch.images, device=compute.device)
-        features = model.aggregate(tokens, reference=reference)
+        features = model.aggregate(tokens, reference=reference or model.spec.reference)
     return Reconstruction.from_prediction(model.decode(features), batch)
+
+
+def not_finite(result: Reconstruction) -> str | None:
+    """Return a sentence when cameras, or all depth of a view, are not finite numbers; None for a usable result."""
+    dead = ~np.isfinite(result.depth_z).any(axis=(1, 2))
+    if result.has_cameras:
+        for values in result.cameras():
+            dead |= ~np.isfinite(values).all(axis=(1, 2))
+    if not dead.any():
+        return None
+    return f"The model's answer is not a finite number for {dead.sum()} of {len(result)} views."
 
 
 def reconstruct(
@@ -83,7 +117,7 @@ def reconstruct(
         photos: what `freegeo.load_photos` takes or returned.
         adapter: an adapter of this model, or the folder of a saved one; it is used for this call, and the model is left
             as it was. None: the model in its present state, with the adapter that is on, if there is one.
-        reference: rule of the reference view; None: the first view with an adapter, as in adaptation, else the model's.
+        reference: rule of the reference view; None: the model's own, with and without an adapter.
         device: cpu, cuda, cuda:N or mps; None: the best available.
         precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
         max_views: most photos that are used; a list that `freegeo.load_photos` returned is used whole.
@@ -248,48 +282,64 @@ class Hooks:
 class Job:
     """The inputs and settings that turn photos into an output folder; parts that already exist are kept."""
 
-    model: ReconstructionModel
+    load: Callable[[], ReconstructionModel]
+    """Loads the model; called when something has to be computed with it."""
+    spec: ModelSpec
     batch: ImageBatch
     folder: RunFolder
     recipe: Recipe | None
     """None: reconstruct with the frozen model, or with `adapter`."""
-    scene: SceneImages | None = None
-    """The images to adapt to (`scene_images`); needed with a recipe."""
+    scene: Callable[[ReconstructionModel], SceneImages] | None = None
+    """Makes the images to adapt to (`scene_images`); needed with a recipe."""
     adapter: Path | None = None
     """A saved adapter to reconstruct with, instead of training one."""
     seed: int = SEED
     compute: Compute = CPU
     reference: str | None = None
-    """Reference-view rule of the frozen model; None: the model's own."""
+    """Reference-view rule of all predictions; None: the model's own."""
     formats: Sequence[str] = DEFAULT_FORMATS
     """Files to write besides the predictions, names of `freegeo.export.formats.FORMATS`."""
     filters: FilterSettings = field(default_factory=FilterSettings)
     masks: list[np.ndarray] | None = None
     """One (H, W) array per photo at its size, not zero where points are wanted."""
     hooks: Hooks = field(default_factory=Hooks)
-    timings: dict[str, float] = field(default_factory=dict)
+    checkpoint: Mapping[str, str] | None = None
+    """File name and fingerprint of the weights, for reconstruction.json."""
     command: str | None = None
     """The command line, for reconstruction.json."""
     warnings: list[str] = field(default_factory=list)
     """What makes the result doubtful, one sentence each, for reconstruction.json; may grow until that is written."""
     after: Callable[[Job], None] = lambda job: None
     """Called before the folder is marked as finished, to write more."""
-    in_place: Adapter | None = None
-    """The adapter that the final prediction was made with; it stays on the model."""
+
+    @cached_property
+    def model(self) -> ReconstructionModel:
+        """The frozen model, loaded when it is first used."""
+        return self.load()
+
+    @cached_property
+    def in_place(self) -> Adapter | None:
+        """The adapter of the result, trained or loaded; attached to the model and switched on when first used."""
+        if self.recipe is not None:
+            return adapter_files.load_adapter(self.model, self.folder / ADAPTER_FOLDER)
+        return None if self.adapter is None else adapter_files.load_adapter(self.model, self.adapter)
 
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
-        # Checks that the views fit into memory before an adapter is trained for them.
-        plan_reconstruction(self.model, len(self.batch), self.batch.image_hw, compute=self.compute)
-        frozen = None
+        frozen, rejected = None, None
         if self.recipe is not None:
             frozen = self._predicted(self.folder / FROZEN_FOLDER, "frozen prediction")
-            self.in_place = self._trained(self.recipe)
-        elif self.adapter is not None:
-            self.in_place = adapter_files.load_adapter(self.model, self.adapter)
-        final = self._predicted(self.folder.path, "adapted prediction" if self.in_place else "prediction")
-        report = self._export(final)
-        summary = self._summary(final, frozen, report)
+            rejected = self._trained(self.recipe)
+        if frozen is not None and rejected is None:
+            final, rejected = self._adapted_prediction(frozen)
+        elif frozen is not None:
+            final = self._kept(frozen)
+        else:
+            final = self._predicted(self.folder.path, "adapted prediction" if self.adapter else "prediction")
+        if rejected is not None:
+            self._warn(f"{rejected} The result is that of the frozen model.")
+        report = self._export(final, frozen)
+        summary = self._summary(final, frozen, report, rejected)
         write_json(self.folder / SUMMARY_NAME, summary)
         self.after(self)
         self.hooks.stage("report")
@@ -298,60 +348,108 @@ class Job:
         return summary
 
     def _predicted(self, folder: Path, stage: str) -> Reconstruction:
+        """Predict with the frozen model, or with `adapter`, or read what is there already."""
         if (folder / PREDICTION_NAME).is_file():
             return Reconstruction.load(folder)
-        reference = None if self.in_place else self.reference
+        if self.adapter is not None:
+            assert self.in_place is not None
         with self._timed(stage):
-            result = predict(self.model, self.batch, reference=reference, compute=self.compute)
+            result = predict(self.model, self.batch, reference=self.reference, compute=self.compute)
             result.save(folder)
         return result
 
-    def _trained(self, recipe: Recipe) -> Adapter:
-        """Train the adapter, or continue training it, or load the finished one."""
+    def _trained(self, recipe: Recipe) -> str | None:
+        """Train the adapter, or continue training it, unless it is finished; returns why it cannot be used."""
         folder = self.folder / ADAPTER_FOLDER
-        if (folder / METADATA).is_file():
-            return adapter_files.load_adapter(self.model, folder)
-        assert self.scene is not None
-        with self._timed("adaptation"):
+        if not (folder / METADATA).is_file():
+            assert self.scene is not None
+            self.hooks.stage("adaptation")
             result = train_adapter(
-                self.model, [self.scene], recipe, seed=self.seed, compute=self.compute, resume_in=folder,
+                self.model, [self.scene(self.model)], recipe, seed=self.seed, compute=self.compute, resume_in=folder,
                 on_step=self.hooks.step,
             )  # fmt: skip
-        result.save(folder)
-        return result.adapter
+            result.save(folder)
+            self.in_place = result.adapter
+            self.folder.note("adaptation", {"seconds": {"adaptation": round(result.seconds, 2)}})
+        return read_json(folder / METADATA).get("trouble")
 
-    def _export(self, final: Reconstruction) -> FilterReport | None:
-        """Filter once and write all formats; None without cameras, which have no points."""
+    def _adapted_prediction(self, frozen: Reconstruction) -> tuple[Reconstruction, str | None]:
+        """Predict with the trained adapter; the frozen prediction and the reason when that gives no usable numbers."""
+        path = self.folder.path
+        if (path / PREDICTION_NAME).is_file():
+            return Reconstruction.load(path), self._noted("prediction").get("rejected")
+        assert self.in_place is not None
+        with self._timed("adapted prediction"):
+            result = _predict(self.model, self.batch, reference=self.reference, compute=self.compute)
+            rejected = not_finite(result)
+            if rejected is None:
+                result.save(path)
+        if rejected is None:
+            return result, None
+        rejected = f"With the adapter: {rejected}"
+        self.folder.note("prediction", {**self._noted("prediction"), "rejected": rejected})
+        return self._kept(frozen), rejected
+
+    def _kept(self, frozen: Reconstruction) -> Reconstruction:
+        """Make the frozen prediction the result."""
+        frozen.save(self.folder.path)
+        return frozen
+
+    def _warn(self, sentence: str) -> None:
+        """Log a warning that reconstruction.json must hold, whoever listens to the log."""
+        logger.warning("%s", sentence)
+        if sentence not in self.warnings:
+            self.warnings.append(sentence)
+
+    def _export(self, final: Reconstruction, frozen: Reconstruction | None) -> FilterReport | None:
+        """Filter each reconstruction once and write all formats; None without cameras, which have no points."""
         if not final.has_cameras:
             return None
-        with self._timed("points and files"):
+        with self._timed(FILES_STAGE):
             masks = None if self.masks is None else masks_for_model(final, self.masks)
-            filtered = filter_reconstruction(final, masks=masks, settings=self.filters)
+            if frozen is not None:
+                save_kept(self.folder / FROZEN_FOLDER, self._filtered(frozen, masks))
+            filtered = self._filtered(final, masks)
+            save_kept(self.folder.path, filtered)
             export(final, self.folder.path, self.formats, filtered=filtered, seed=self.seed)
         return filtered[1]
 
+    def _filtered(self, reconstruction: Reconstruction, masks: np.ndarray | None) -> Filtered:
+        return filter_reconstruction(reconstruction, masks=masks, settings=self.filters)
+
     def _summary(
-        self, final: Reconstruction, frozen: Reconstruction | None, report: FilterReport | None
+        self,
+        final: Reconstruction,
+        frozen: Reconstruction | None,
+        report: FilterReport | None,
+        rejected: str | None,
     ) -> dict[str, Any]:
-        loaded = getattr(self.model, "loaded_from", None)
+        trained = self.recipe is not None and rejected is None
+        settings = dict(self.folder.settings)
+        seconds = {name: value for part in self.folder.notes.values() for name, value in part["seconds"].items()}
         return {
             "format": FORMAT,
-            "model": self.model.spec.name,
-            "checkpoint": {"file": loaded.file, "fingerprint": loaded.fingerprint} if loaded else None,
-            "licence_of_weights": self.model.spec.weights_licence,
+            "model": self.spec.name,
+            "checkpoint": self.checkpoint,
+            "licence_of_weights": self.spec.weights_licence,
             "images": list(final.names),
             "image_hw": list(final.image_hw),
-            "adapter": ADAPTER_FOLDER if self.recipe else (str(self.adapter) if self.adapter else None),
+            "adapter": ADAPTER_FOLDER if trained else (str(self.adapter) if self.adapter else None),
+            "rejected_adapter": rejected,
             "frozen_prediction": f"{FROZEN_FOLDER}/{PREDICTION_NAME}" if frozen is not None else None,
+            "reference_view": self.reference or self.spec.reference,
             "warnings": list(self.warnings),
             "loss": self._loss_change(),
             "filters": None if report is None else {"pixels": report.pixels, "removed": dict(report.removed)},
-            "recipe": self.folder.settings.get("recipe"),
-            "settings": dict(self.folder.settings),
+            "recipe": None if self.recipe is None else as_json(asdict(self.recipe)),
+            "settings": settings,
             "command": self.command,
-            "seconds": {name: round(value, 2) for name, value in self.timings.items()},
+            "seconds": seconds,
             "versions": versions(),
         }
+
+    def _noted(self, part: str) -> dict[str, Any]:
+        return self.folder.notes.get(part) or {"seconds": {}}
 
     def _loss_change(self) -> dict[str, float] | None:
         """Return the mean total loss of the first and last tenth of the steps."""
@@ -362,18 +460,16 @@ class Job:
 
     @contextmanager
     def _timed(self, stage: str) -> Generator[None]:
-        """Announce a stage and note how long it took."""
+        """Announce a stage and note how long it took, also for processes that continue this run."""
         self.hooks.stage(stage)
         started = time.monotonic()
         yield
-        self.timings[stage] = time.monotonic() - started
+        part = FILTERS if stage == FILES_STAGE else PREDICTION
+        noted = self._noted(part.name)
+        seconds = {**noted["seconds"], stage: round(time.monotonic() - started, 2)}
+        self.folder.note(part.name, {**noted, "seconds": seconds})
 
 
 def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
     return {"freegeo": __version__, "torch": torch.__version__, "python": platform.python_version()}
-
-
-def settings_of(recipe: Recipe | None, **others: Any) -> Mapping[str, Any]:
-    """Return the settings that an output folder is compared by."""
-    return {**others, "recipe": None if recipe is None else asdict(recipe)}

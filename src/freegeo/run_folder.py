@@ -1,7 +1,8 @@
 """Output folders of commands: locked while one writes, continued after a stop, never mixed.
 
-A command's output folder goes through three states: absent, unfinished (its settings are stored, its parts appear one
-by one) and finished (the marker names when). Only the standard library is used here.
+A command's output folder goes through three states: absent, unfinished (its settings are stored, its files appear one
+by one) and finished (the marker names when). Settings may be ordered in parts: when a part changes, the files that
+depend on it or on a later part go, and the others stay. Only the standard library is used here.
 """
 
 from __future__ import annotations
@@ -9,15 +10,25 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import FORMAT, LEDGER_FILE, LOCK_FILE, OWN_FILES, RUN_FILE, as_json, read_json, write_json
+from freegeo.files import (
+    FORMAT,
+    LEDGER_FILE,
+    LOCK_FILE,
+    OWN_FILES,
+    RUN_FILE,
+    as_json,
+    atomic_path,
+    read_json,
+    write_json,
+)  # fmt: skip
 
 _SHOWN = 4
 _PART = re.compile(r"\..+\.[0-9a-f]{8}\.part(\..*)?")
@@ -70,12 +81,30 @@ def _try_lock(handle) -> bool:
 
 
 @dataclass(frozen=True)
+class Part:
+    """A part of a command's settings, and the files that depend on it and on the parts before it."""
+
+    name: str
+    """Its name among the settings."""
+    files: tuple[str, ...]
+    """Names of files, and of folders with a slash at the end; the empty name stands for every file."""
+    free: bool = False
+    """Whether it may change without `overwrite`: what depends on it costs little to make again."""
+
+    def owns(self, name: str) -> bool:
+        """Whether a file of the folder depends on this part."""
+        return any(name == own or ((own.endswith("/") or not own) and name.startswith(own)) for own in self.files)
+
+
+@dataclass(frozen=True)
 class RunFolder:
     """One command's output folder, locked while the command runs."""
 
     path: Path
     settings: Mapping[str, Any]
     finished_at: str | None
+    notes: dict[str, Any] = field(default_factory=dict)
+    """What processes of this run noted down, by the part of the settings that it depends on."""
 
     @property
     def finished(self) -> bool:
@@ -86,28 +115,54 @@ class RunFolder:
         """Return the path of a file in the folder."""
         return self.path / name
 
+    def note(self, part: str, value: Any) -> None:
+        """Keep a JSON-like value for processes that continue this run, until the part of the settings changes."""
+        self.notes[part] = value
+        self._write(None)
+
     def finish(self) -> None:
         """Mark the result as complete."""
-        write_json(self.path / RUN_FILE, _state(self.settings, datetime.now(UTC).isoformat(timespec="seconds")))
+        self._write(datetime.now(UTC).isoformat(timespec="seconds"))
+
+    def _write(self, finished: str | None) -> None:
+        write_json(self.path / RUN_FILE, _state(self.settings, finished, self.notes))
 
 
 @contextmanager
-def run_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool = False) -> Generator[RunFolder]:
+def run_folder(
+    path: Path,
+    settings: Mapping[str, Any],
+    *,
+    overwrite: bool = False,
+    parts: Sequence[Part] = (),
+    labels: Mapping[str, str] | None = None,
+) -> Generator[RunFolder]:
     """Open an output folder for a command with JSON-like settings.
 
     Absent or empty: a run is started. Unfinished with the same settings: it continues. Finished with the same settings:
-    `finished` is true and the caller must not write. Other settings, or a folder that freegeo did not write: UserError.
-    `overwrite` removes what earlier runs wrote, and nothing else; a folder that freegeo did not write is still refused.
-    When the block raises UserError before it wrote a file, the settings file and a new folder are removed again.
+    `finished` is true and the caller must not write. When a free part of the settings differs, the files that depend on
+    it are removed, and the run is unfinished. Other differences, or a folder that freegeo did not write: UserError.
+    `overwrite` removes what depends on the first part that differs (everything, when none does or there are no parts),
+    and never what freegeo did not write; a folder that freegeo did not write is still refused. When the block raises
+    UserError before it wrote a file, the settings file and a new folder are removed again.
+
+    Args:
+        path: of the folder.
+        settings: what the result depends on.
+        overwrite: see above.
+        parts: of the settings, each depending on those before it; settings in no part come before all.
+        labels: what messages call a setting (`difference`).
     """
     settings = as_json(settings)
-    check_folder(path, settings, overwrite=overwrite)
+    check_folder(path, settings, overwrite=overwrite, parts=parts, labels=labels)
     is_new = not path.exists()
     try:
         with locked(path):
-            finished_at = _open(path, settings, overwrite)
+            # The state is read again under the lock: another process may have changed it since the check.
+            check_folder(path, settings, overwrite=overwrite, parts=parts, labels=labels)
+            folder = _open(path, settings, overwrite, parts)
             try:
-                yield RunFolder(path, settings, finished_at)
+                yield folder
             except UserError:
                 if not _ledger(path):
                     (path / RUN_FILE).unlink(missing_ok=True)
@@ -117,23 +172,38 @@ def run_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool = Fal
             path.rmdir()
 
 
-def _open(path: Path, settings: Mapping[str, Any], overwrite: bool) -> str | None:
-    """Start or continue the run of a locked folder; returns when it was finished."""
-    # The state is read again under the lock: another process may have changed it since the check.
-    check_folder(path, settings, overwrite=overwrite)
-    before = stored_state(path)
-    if before is not None and overwrite:
-        clear(path)
-        before = None
-    if before is None:
-        write_json(path / RUN_FILE, _state(settings, None))
-        return None
-    if not before["finished"]:
-        _remove_parts(path)
-    return before["finished"]
+def _open(path: Path, settings: Mapping[str, Any], overwrite: bool, parts: Sequence[Part]) -> RunFolder:
+    """Start or continue the run of a locked folder."""
+    before, notes = stored_state(path), {}
+    if before is not None:
+        same = before["settings"] == settings
+        if same and not overwrite:
+            if not before["finished"]:
+                _remove_parts(path)
+            return RunFolder(path, settings, before["finished"], before.get("notes") or {})
+        kept = [] if same else parts[: _unchanged(before["settings"], settings, parts)]
+        clear(path, keep=lambda name: any(part.owns(name) for part in kept))
+        notes = {part.name: before["notes"][part.name] for part in kept if part.name in (before.get("notes") or {})}
+    write_json(path / RUN_FILE, _state(settings, None, notes))
+    return RunFolder(path, settings, None, notes)
 
 
-def check_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool) -> None:
+def _unchanged(before: Mapping[str, Any], now: Mapping[str, Any], parts: Sequence[Part]) -> int:
+    """Return how many parts are as before, up to the first that is not; 0 when settings in no part differ."""
+    names = [part.name for part in parts]
+    if any(before.get(name) != now.get(name) for name in (set(before) | set(now)) - set(names)):
+        return 0
+    return next((k for k, name in enumerate(names) if before.get(name) != now.get(name)), len(parts))
+
+
+def check_folder(
+    path: Path,
+    settings: Mapping[str, Any],
+    *,
+    overwrite: bool,
+    parts: Sequence[Part] = (),
+    labels: Mapping[str, str] | None = None,
+) -> None:
     """Raise UserError when `run_folder` would refuse; cheap, so that commands can check before they load anything."""
     settings = as_json(settings)
     if path.exists() and not path.is_dir():
@@ -146,10 +216,11 @@ def check_folder(path: Path, settings: Mapping[str, Any], *, overwrite: bool) ->
         return
     if before["format"] > FORMAT:
         raise UserError(f"{path}: written by a newer freegeo (format {before['format']}). Update freegeo.")
-    if before["settings"] != settings and not overwrite:
+    free = all(part.free for part in parts[_unchanged(before["settings"], settings, parts) :]) and bool(parts)
+    if before["settings"] != settings and not free and not overwrite:
         state = "a finished result" if before["finished"] else "an unfinished run"
         raise UserError(
-            f"{path}: holds {state} with other options ({difference(before['settings'], settings)}). "
+            f"{path}: holds {state} with other options ({difference(before['settings'], settings, labels)}). "
             "Add --overwrite to replace it, or choose another folder."
         )
     _require_writable(path)
@@ -166,13 +237,14 @@ def stored_state(path: Path) -> dict[str, Any] | None:
     return state
 
 
-def clear(path: Path) -> None:
-    """Remove what earlier runs wrote into a folder, and nothing that anybody else put there."""
+def clear(path: Path, *, keep: Callable[[str], bool] = lambda name: False) -> None:
+    """Remove what earlier runs wrote into a folder, without the names to `keep`, and nothing that others put there."""
     state = stored_state(path)
     if state is not None:
         # If the removal is interrupted, the remaining files must not count as a finished result.
         write_json(path / RUN_FILE, {**state, "finished": None})
-    files = [path / name for name in _ledger(path)]
+    names = _ledger(path)
+    files = [path / name for name in names if not keep(name)]
     for file in files:
         if file.is_symlink() or file.is_file():
             file.unlink()
@@ -181,15 +253,22 @@ def clear(path: Path) -> None:
     for folder in sorted(inner, key=lambda f: len(f.parts), reverse=True):
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
-    (path / LEDGER_FILE).unlink(missing_ok=True)
+    kept = [name for name in names if keep(name)]
+    if kept:
+        with atomic_path(path / LEDGER_FILE) as part:
+            part.write_text("".join(f"{name}\n" for name in kept), encoding="utf-8")
+    else:
+        (path / LEDGER_FILE).unlink(missing_ok=True)
 
 
-def difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+def difference(before: Mapping[str, Any], now: Mapping[str, Any], labels: Mapping[str, str] | None = None) -> str:
     """Name the settings that differ, dotted where they are nested, with both values; empty when none does.
 
     At most four are named, for the rest their number is given. Both are as read from JSON (`freegeo.files.as_json`).
+    `labels` maps the last name of a setting to what to say instead: an option such as `--seed`, followed by the values,
+    or a phrase that stands alone.
     """
-    parts = list(_differences(before, now))
+    parts = list(dict.fromkeys(_differences(before, now, labels or {})))
     more = len(parts) - _SHOWN
     return "; ".join(parts[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
 
@@ -209,8 +288,8 @@ def _remove_parts(path: Path) -> None:
                 file.unlink()
 
 
-def _state(settings: Mapping[str, Any], finished: str | None) -> dict[str, Any]:
-    return {"format": FORMAT, "settings": settings, "finished": finished}
+def _state(settings: Mapping[str, Any], finished: str | None, notes: Mapping[str, Any]) -> dict[str, Any]:
+    return {"format": FORMAT, "settings": settings, "finished": finished, "notes": notes}
 
 
 def _require_writable(path: Path) -> None:
@@ -219,13 +298,18 @@ def _require_writable(path: Path) -> None:
         raise UserError(f"{path}: the output folder cannot be written to. Choose another one.")
 
 
-def _differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+def _differences(
+    before: Mapping[str, Any], now: Mapping[str, Any], labels: Mapping[str, str], prefix: str = ""
+) -> Iterator[str]:
     for name in sorted(set(before) | set(now)):
         old, new = before.get(name), now.get(name)
+        label = labels.get(name, f"{prefix}{name}")
         if isinstance(old, dict) and isinstance(new, dict):
-            yield from _differences(old, new, f"{prefix}{name}.")
+            yield from _differences(old, new, labels, f"{prefix}{name}.")
+        elif old != new and name in labels and not label.startswith("--"):
+            yield label
         elif old != new:
-            yield f"{prefix}{name}: {_short(old)} there, {_short(new)} now"
+            yield f"{label}: {_short(old)} there, {_short(new)} now"
 
 
 def _short(value: Any) -> str:

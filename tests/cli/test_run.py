@@ -6,6 +6,8 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +17,13 @@ from safetensors.numpy import load_file
 
 from cli.conftest import PHOTOS, QUICK
 from freegeo.adaptation import adapt as adapting
+from freegeo.adaptation.adapter import is_adapted
 from freegeo.adaptation.state import UNFINISHED_FILE
 from freegeo.export import formats
 from freegeo.files import LEDGER_FILE, LOCK_FILE, RUN_FILE
 
 ADAPTER_FILES = {"adapter_config.json", "adapter_model.safetensors", "camera_token.safetensors", "freegeo.json"}
-RESULT_FILES = {"reconstruction.json", "prediction.npz", "points.ply", "scene.glb"}
+RESULT_FILES = {"reconstruction.json", "prediction.npz", "kept.npz", "points.ply", "scene.glb"}
 ARRAYS = {
     "depth_z": (PHOTOS, 48, 64),
     "conf": (PHOTOS, 48, 64),
@@ -62,7 +65,9 @@ def finished(tmp_path_factory, photo_folder, tiny) -> Path:
 
 
 def test_run_writes_what_the_design_says(finished):
-    expected = RESULT_FILES | {"frozen/prediction.npz"} | {f"adapter/{name}" for name in ADAPTER_FILES}
+    expected = (
+        RESULT_FILES | {"frozen/prediction.npz", "frozen/kept.npz"} | {f"adapter/{name}" for name in ADAPTER_FILES}
+    )
     assert files(finished) - {"report.html"} == expected
     assert not (finished / LOCK_FILE).exists()
 
@@ -118,7 +123,7 @@ def test_other_options_ask_for_overwrite(freegeo, finished, photo_folder, tiny):
     before = files(finished)
     outcome = freegeo("run", photo_folder, "-o", finished, *tiny, *QUICK, "--seed", 7)
     assert outcome.code == 2
-    assert "seed: 43 there, 7 now" in outcome.sentence()
+    assert "--seed: 43 there, 7 now" in outcome.sentence()
     assert "--overwrite" in outcome.sentence()
     assert files(finished) == before
 
@@ -130,7 +135,7 @@ def test_other_photos_of_the_same_names_are_other_options(freegeo, finished, pho
         Image.open(path).transpose(Image.Transpose.FLIP_LEFT_RIGHT).save(tmp_path / path.name)
     outcome = freegeo("run", tmp_path, "-o", finished, *tiny, *QUICK)
     assert outcome.code == 2
-    assert "photo_contents" in outcome.sentence()
+    assert "photos with other contents" in outcome.sentence()
 
 
 def test_overwrite_replaces_the_result_and_spares_the_users_files(freegeo, photo_folder, tiny, tmp_path):
@@ -140,6 +145,134 @@ def test_overwrite_replaces_the_result_and_spares_the_users_files(freegeo, photo
     outcome = freegeo("run", photo_folder, "-o", out, *tiny, "--no-adapt", "--overwrite")
     assert outcome.code == 0, outcome.err
     assert files(out) - {"report.html"} == RESULT_FILES | {"notes.txt"}
+
+
+@pytest.fixture
+def no_model(monkeypatch):
+    """Fails when anything is computed with a model."""
+
+    def load(*arguments, **options):
+        raise AssertionError("the weights were loaded")
+
+    monkeypatch.setattr("freegeo.models.catalog.load_model", load)
+
+
+@pytest.fixture
+def copy(finished, tmp_path) -> Path:
+    shutil.copytree(finished, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def write_masks(folder: Path, rows: int) -> Path:
+    from PIL import Image
+
+    folder.mkdir(exist_ok=True)
+    mask = np.zeros((48, 64), np.uint8)
+    mask[:rows] = 255
+    for k in range(PHOTOS):
+        Image.fromarray(mask).save(folder / f"{k}.png")
+    return folder
+
+
+def points(folder: Path) -> int:
+    return len(trimesh.load(folder / "points.ply").vertices)
+
+
+def test_a_finished_folder_is_recognised_without_the_weights(freegeo, finished, photo_folder, tiny, no_model):
+    assert "already finished" in freegeo("run", photo_folder, "-o", finished, *tiny, *QUICK).out
+
+
+def test_other_formats_and_filters_are_written_without_adapting_again(freegeo, copy, photo_folder, tiny, no_model):
+    before, adapter = prediction(copy), (copy / "adapter" / "adapter_model.safetensors").stat().st_mtime_ns
+    few = points(copy)
+    command = ("run", photo_folder, "-o", copy, *tiny, *QUICK)
+    outcome = freegeo(*command, "--formats", "depth")
+    assert outcome.code == 0, outcome.err
+    assert {"points.ply", "scene.glb", "depth/0.png", "report.html"} <= files(copy)
+    outcome = freegeo(*command, "--drop-share", 0, "--no-flying", "--no-multi-view")
+    assert outcome.code == 0, outcome.err
+    assert points(copy) == PHOTOS * 48 * 64 > few
+    assert (copy / "depth" / "0.png").is_file()
+    assert same(prediction(copy), before)
+    assert (copy / "adapter" / "adapter_model.safetensors").stat().st_mtime_ns == adapter
+    summary = json.loads((copy / "reconstruction.json").read_text())
+    assert sum(summary["filters"]["removed"].values()) == 0
+    assert "adaptation" in summary["seconds"]
+    assert "100.0 % of" in (copy / "report.html").read_text()
+    again = freegeo(*command, "--drop-share", 0, "--no-flying", "--no-multi-view")
+    assert "already finished" in again.out
+
+
+def test_masks_that_changed_in_place_are_other_masks(freegeo, copy, photo_folder, tiny, tmp_path, no_model):
+    masks = write_masks(tmp_path / "masks", 30)
+    command = ("run", photo_folder, "-o", copy, *tiny, *QUICK, "--masks", masks)
+    assert freegeo(*command).code == 0
+    assert "already finished" in freegeo(*command).out
+    with_30 = points(copy)
+    write_masks(masks, 10)
+    outcome = freegeo(*command)
+    assert outcome.code == 0
+    assert "already finished" not in outcome.out
+    assert points(copy) < with_30
+    with np.load(copy / "kept.npz") as kept, np.load(copy / "frozen" / "kept.npz") as frozen:
+        assert not kept["keep"][:, 10:].any()
+        assert not frozen["keep"][:, 10:].any()
+        assert f"{100 * kept['keep'].mean():.1f} % of" in (copy / "report.html").read_text()
+
+
+def test_another_reference_view_keeps_the_adapter(freegeo, copy, photo_folder, tiny):
+    trained = (copy / "adapter" / "adapter_model.safetensors").stat().st_mtime_ns
+    before, frozen = prediction(copy), prediction(copy / "frozen")
+    command = ("run", photo_folder, "-o", copy, *tiny, *QUICK, "--reference", "middle")
+    outcome = freegeo(*command)
+    assert outcome.code == 2
+    assert '--reference: "first" there, "middle" now' in outcome.sentence()
+    assert freegeo(*command, "--overwrite").code == 0
+    assert (copy / "adapter" / "adapter_model.safetensors").stat().st_mtime_ns == trained
+    assert not np.allclose(prediction(copy)["depth_z"], before["depth_z"])
+    assert not np.allclose(prediction(copy / "frozen")["depth_z"], frozen["depth_z"])
+    assert json.loads((copy / "reconstruction.json").read_text())["reference_view"] == "middle"
+
+
+def test_an_adapter_that_changes_nothing_gives_the_frozen_result(freegeo, photo_folder, weights, tmp_path, monkeypatch):
+    from freegeo.models import da3_config
+
+    entry = next(e for e in da3_config.ENTRIES if e.name == "freegeo-tiny")
+    spec = replace(entry.build().spec, reference="middle")
+    other = replace(entry, build=partial(da3_config.build, da3_config.EMBEDDED, spec))
+    monkeypatch.setattr(da3_config, "ENTRIES", (other,))
+    arguments = ("--model", "freegeo-tiny", "--checkpoint", weights, *QUICK, "--lr", 1e-30)
+    outcome = freegeo("run", photo_folder, "-o", tmp_path / "out", *arguments)
+    assert outcome.code == 0, outcome.err
+    frozen, adapted = prediction(tmp_path / "out" / "frozen"), prediction(tmp_path / "out")
+    for name in ("depth_z", "T_cam_world", "K"):
+        assert np.allclose(frozen[name], adapted[name], rtol=1e-3, atol=1e-4)
+    first = freegeo("run", photo_folder, "-o", tmp_path / "a", *arguments, "--no-adapt", "--reference", "first")
+    assert first.code == 0
+    assert not np.allclose(prediction(tmp_path / "a")["T_cam_world"], frozen["T_cam_world"], rtol=1e-2, atol=1e-2)
+
+
+def test_numbers_that_are_not_finite_after_adaptation_leave_the_frozen_result(
+    freegeo, finished, photo_folder, tiny, tmp_path, monkeypatch
+):
+    from freegeo import pipeline
+
+    out, plain = tmp_path / "out", pipeline._predict
+
+    def broken(model, batch, **options):
+        found = plain(model, batch, **options)
+        return replace(found, depth_z=np.full_like(found.depth_z, np.nan)) if is_adapted(model) else found
+
+    monkeypatch.setattr(pipeline, "_predict", broken)
+    for more in ((), ("--formats", "depth")):
+        outcome = freegeo("run", photo_folder, "-o", out, *tiny, *QUICK, *more)
+        assert outcome.code == 0, outcome.err
+        sentence = f"not a finite number for {PHOTOS} of {PHOTOS} views. The result is that of the frozen model."
+        summary = json.loads((out / "reconstruction.json").read_text())
+        for text in (outcome.err, outcome.out, " ".join(summary["warnings"]), (out / "report.html").read_text()):
+            assert sentence in text
+        assert same(prediction(out), prediction(finished / "frozen"))
+        assert summary["adapter"] is None
 
 
 def test_run_without_adapting_is_the_frozen_reconstruction(freegeo, finished, photo_folder, tiny, tmp_path):
@@ -210,7 +343,7 @@ def test_retrained_adapter_is_another_option(freegeo, photo_folder, tiny, tmp_pa
     assert freegeo("adapt", photo_folder, "-o", adapter, *tiny, *QUICK, "--seed", 7, "--overwrite").code == 0
     outcome = freegeo("reconstruct", photo_folder, "-o", out, *tiny, "--adapter", adapter)
     assert outcome.code == 2
-    assert "adapter.weights" in outcome.sentence()
+    assert "another adapter" in outcome.sentence()
 
 
 # -- interruption
@@ -284,6 +417,7 @@ def test_killed_process_continues_to_the_same_result(freegeo, finished, photo_fo
     code = f"""
 import time
 from freegeo.adaptation import adapt as adapting
+from freegeo.adaptation.adapter import is_adapted
 from freegeo.cli.app import main
 plain, calls = adapting.adaptation_loss, []
 def slow(*arguments, **options):

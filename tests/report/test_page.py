@@ -10,6 +10,8 @@ import pytest
 from exact_rooms import room
 from example_results import HOSTILE_NAME, write_example
 from freegeo import files
+from freegeo.export.kept import save_kept
+from freegeo.fusion.filtering import FilterReport
 from freegeo.report import figures, scene3d
 from freegeo.report.page import flattened, score_table, write_report
 from freegeo.report.result import load_result
@@ -86,15 +88,30 @@ def test_a_frozen_run_without_cameras_has_a_page(tmp_path):
     assert "not stated in this folder" in text
 
 
-def test_the_filters_that_the_run_noted_are_shown(tmp_path):
+def test_the_page_shows_the_points_that_the_command_kept(tmp_path):
+    folder = write_example(tmp_path / "out", truth=False)
+    shape = load_result(folder).final.keep.shape
+    keep = np.zeros(shape, dtype=bool)
+    keep[:, :5] = True
+    report = FilterReport(pixels=keep.size, removed={"mask": int((~keep).sum()), "sky": 0}, tolerance=None)
+    save_kept(folder, (keep, report))
+    result = load_result(folder)
+    assert np.array_equal(result.final.keep, keep)
+    assert not np.array_equal(result.stages["frozen"].keep, keep)
+    text = write_report(folder).read_text(encoding="utf-8")
+    share = f"{100 * keep.mean():.1f} %"
+    assert f"{share} of {keep.size:,}" in text
+    assert re.search(rf"kept</th><td>{int(keep.sum()):,}</td><td>{share}", text)
+    assert "Depth of all views together" not in text
+
+
+def test_a_rejected_adapter_leaves_the_frozen_model_alone_on_the_page(tmp_path):
     folder = write_example(tmp_path / "out", truth=False)
     summary = files.read_json(folder / "reconstruction.json")
-    summary["filters"] = {"pixels": 1000, "removed": {"mask": 123, "sky": 0}}
-    files.write_json(folder / "reconstruction.json", summary)
-    text = write_report(folder).read_text(encoding="utf-8")
-    assert re.search(r"outside the user&#39;s masks</th><td>123</td><td>12.3 %", text)
-    assert re.search(r"kept</th><td>877</td><td>87.7 %", text)
-    assert "Depth of all views together" not in text
+    files.write_json(folder / "reconstruction.json", {**summary, "adapter": None, "rejected_adapter": "It diverged."})
+    result = load_result(folder)
+    assert list(result.stages) == ["frozen"]
+    assert result.final.key == "frozen"
 
 
 def test_the_scene_holds_the_points_it_says(scene):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from freegeo.cli import console
-from freegeo.cli.jobs import say_finished
+from freegeo.cli.jobs import LABELS, check_place, say_finished
 from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source, split_scenes
 from freegeo.progress import step_bar
@@ -44,23 +45,26 @@ def adapt(
     published
         Also write the adapter in the layout of the authors' release, below `published`.
     """
-    from freegeo.pipeline import require_enough_photos, scene_images, settings_of
-    from freegeo.run_folder import check_folder, run_folder
+    from freegeo.pipeline import require_enough_photos, scene_images
+    from freegeo.run_folder import run_folder
 
+    check_place(output)
+    empty = model.build_empty()
+    plan = recipe.build(empty.spec)
     scenes = {str(part[0]): load_source(part, photos) for part in split_scenes(sources)}
     for found in scenes.values():
         require_enough_photos(found)
-    loaded = model.load()
-    plan = recipe.build(loaded.spec)
-    batches = {name: loaded.preprocess(found) for name, found in scenes.items()}
+    batches = {name: empty.preprocess(found) for name, found in scenes.items()}
     about = {name: {"photos": list(batch.names), "contents": batch.digest()} for name, batch in batches.items()}
-    settings = settings_of(plan, command="adapt", scenes=about, published=published, **model.settings(loaded))
-    check_folder(output.output, settings, overwrite=output.overwrite)
-    images = [scene_images(name, scenes[name], loaded, plan, batch) for name, batch in batches.items()]
-    with run_folder(output.output, settings, overwrite=output.overwrite) as folder:
+    settings = {
+        "command": "adapt", "scenes": about, "published": published, **model.identity(), "recipe": asdict(plan),
+    }  # fmt: skip
+    with run_folder(output.output, settings, overwrite=output.overwrite, labels=LABELS) as folder:
         if folder.finished:
             say_finished(output.output, folder.finished_at)
             return
+        loaded = model.load()
+        images = [scene_images(name, scenes[name], loaded, plan, batch) for name, batch in batches.items()]
         _train(loaded, images, plan, model, folder.path, published=published)
         folder.finish()
     console.written(output.output, FILES)

@@ -51,8 +51,6 @@ def demo(
         sparse (photos far apart).
     """
     scene = demo_scene(room, domain)
-    loaded = model.load()
-    plan = recipe.build(loaded.spec)
     extra = {"room": room, "domain": domain}
     target = OutputOptions(output=output, overwrite=overwrite)
 
@@ -62,7 +60,7 @@ def demo(
         write_json(output / SCORES_NAME, score_windows(job, scene))
 
     run_job(
-        scene.photos, loaded, model, target, command="demo", recipe=plan, extra_settings=extra, after=add_scores
+        scene.photos, model, target, command="demo", recipe=recipe, extra_settings=extra, after=add_scores
     )  # fmt: skip
     report(read_json(output / SCORES_NAME), domain)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,13 +14,23 @@ from freegeo.errors import UserError
 from freegeo.export.base import DEFAULT_FORMATS
 from freegeo.export.formats import ALL, FORMATS, chosen_formats
 from freegeo.fusion.settings import FilterSettings
+from freegeo.run_folder import stored_state
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from freegeo.cli.options import OutputOptions
     from freegeo.types import PhotoLike
 
 DEFAULTS = FilterSettings()
+
+
+def _digest(masks: Sequence[np.ndarray]) -> str:
+    """Return a fingerprint of masks; not zero is wanted."""
+    digest = hashlib.sha256()
+    for mask in masks:
+        digest.update(repr(mask.shape).encode() + (mask != 0).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _check_formats(hint: object, names: Sequence[str]) -> None:
@@ -70,15 +81,17 @@ class FileOptions:
     formats: Annotated[tuple[str, ...], FORMAT_NAMES] = DEFAULT_FORMATS
     filters: FilterOptions = FilterOptions()
 
-    def settings(self) -> dict[str, object]:
-        """Return what the files depend on, for comparison with an existing folder."""
+    def filter_settings(self, masks: Sequence[np.ndarray] | None) -> dict[str, object]:
+        """Return what the choice of points depends on, for comparison with an existing folder."""
         values = asdict(self.filters)
-        masks = values.pop("masks")
-        return {
-            "formats": chosen_formats(self.formats),
-            "filters": values,
-            "masks": None if masks is None else str(masks),
-        }
+        del values["masks"]
+        return {**values, "masks": None if masks is None else _digest(masks)}
+
+    def all_formats(self, output: OutputOptions) -> list[str]:
+        """Return the formats asked for, and those that the folder has already, unless it is overwritten."""
+        before = None if output.overwrite else stored_state(output.output)
+        there = [] if before is None else before["settings"].get("formats", [])
+        return chosen_formats([*there, *self.formats])
 
     def checked_masks(self, photos: Sequence[PhotoLike]) -> list[np.ndarray] | None:
         """Read the masks and refuse other sizes than the photos', before anything is computed."""

@@ -4,29 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from freegeo.cli import console
 from freegeo.cli.files import FileOptions
-from freegeo.cli.options import ModelOptions, OutputOptions
+from freegeo.cli.options import ModelOptions, OutputOptions, RecipeOptions
 from freegeo.export import reconstruction as npz
+from freegeo.export.base import KEPT_NAME
 from freegeo.export.formats import FORMATS
 from freegeo.progress import step_bar
-from freegeo.run_folder import check_folder, run_folder
+from freegeo.run_folder import check_folder, run_folder, stored_state
 
 if TYPE_CHECKING:
-    from freegeo.adaptation.recipe import Recipe
-    from freegeo.models.api import ReconstructionModel
     from freegeo.pipeline import Hooks, Job
     from freegeo.types import PhotoLike
 
 DEFAULT_FILES = FileOptions()
-FRAMES_FOLDER = "images"
+_OTHER_CONTENTS = "photos with other contents"
+LABELS = {
+    "photos": "other photos", "photo_contents": _OTHER_CONTENTS, "contents": _OTHER_CONTENTS, "scenes": "other scenes",
+    "checkpoint": "other weights", "weights": "another adapter", "folder": "--adapter", "masks": "other masks",
+    "command": "the command", "recipe": "--adapt", "name": "--recipe", "sets_per_scene": "--sets",
+    **dict.fromkeys(("alpha", "first_seed", "distinct_seeds", "final_lr", "batch"), "what follows from the recipe"),
+    **{
+        name: f"--{name}"
+        for name in (
+            "model", "precision", "seed", "reference", "adapter", "steps", "epochs", "lr", "rank", "hold", "views",
+            "keep", "room", "domain", "published",
+        )
+    },
+}  # fmt: skip
+"""What messages call the settings of an output folder."""
 FILES = {
     "report.html": "the page to look at first",
     npz.FORMAT.path: npz.FORMAT.about,
     "frozen/prediction.npz": "the same before adaptation",
+    KEPT_NAME: "which pixels the filters kept as points",
     "adapter": "the adapter (peft format)",
     **{format.path: format.about for format in FORMATS.values()},
     "images": "the frames of the video that were used",
@@ -45,52 +60,65 @@ def progress_hooks() -> Generator[Hooks]:
 
 def run_job(
     photos: Sequence[PhotoLike],
-    model: ReconstructionModel,
     model_options: ModelOptions,
     output: OutputOptions,
     *,
     command: str,
-    recipe: Recipe | None,
+    recipe: RecipeOptions | None,
     adapter: Path | None = None,
     files: FileOptions = DEFAULT_FILES,
     extra_settings: dict[str, Any] | None = None,
     after: Callable[[Job], None] = lambda job: None,
 ) -> None:
-    """Run a job in its output folder and print the outcome; a finished folder is not changed.
+    """Run a job in its output folder and print the outcome.
 
-    `after` writes more before the folder counts as finished.
+    Everything that can be refused is refused before the weights are loaded. A finished folder is not changed; other
+    filters, masks and formats are written from the predictions that it holds. `after` writes more before the folder
+    counts as finished.
     """
     from freegeo.data.video import VideoFrame
-    from freegeo.pipeline import Job, require_enough_photos, scene_images, settings_of
+    from freegeo.pipeline import FRAMES_FOLDER, PARTS, Job, require_enough_photos, scene_images
 
-    if recipe is not None:
+    check_place(output)
+    empty = model_options.build_empty()
+    plan = None if recipe is None else recipe.build(empty.spec)
+    if plan is not None:
         require_enough_photos(photos)
-    batch = model.preprocess(photos)
-    settings = settings_of(
-        recipe,
-        command=command,
-        photos=list(batch.names),
-        photo_contents=batch.digest(),
-        adapter=None if adapter is None else adapter_identity(adapter),
-        **model_options.settings(model),
-        **files.settings(),
-        **(extra_settings or {}),
-    )
-    check_folder(output.output, settings, overwrite=output.overwrite)
     masks = files.checked_masks(photos)
-    with run_folder(output.output, settings, overwrite=output.overwrite) as folder, progress_hooks() as hooks:
+    batch = empty.preprocess(photos)
+    adaptation = {
+        "photos": list(batch.names), "photo_contents": batch.digest(), **model_options.identity(),
+        "recipe": None if plan is None else asdict(plan),
+        "adapter": None if adapter is None else adapter_identity(adapter),
+    }  # fmt: skip
+    settings = {
+        "command": command,
+        **(extra_settings or {}),
+        "adaptation": adaptation,
+        "prediction": {"reference": model_options.reference or empty.spec.reference},
+        "filters": files.filter_settings(masks),
+        "formats": files.all_formats(output),
+    }
+    options = {"overwrite": output.overwrite, "parts": PARTS, "labels": LABELS}
+    with run_folder(output.output, settings, **options) as folder, progress_hooks() as hooks:
         if folder.finished:
             say_finished(output.output, folder.finished_at)
             return
         save_frames([photo for photo in photos if isinstance(photo, VideoFrame)], folder / FRAMES_FOLDER)
         job = Job(
-            model=model, batch=batch, folder=folder, recipe=recipe, adapter=adapter, seed=model_options.seed,
-            compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
-            command=console.command_line(), warnings=console.warned(), after=after, formats=files.formats,
-            filters=files.filters.settings(), masks=masks,
-            scene=None if recipe is None else scene_images("photos", photos, model, recipe, batch),
+            load=model_options.load, spec=empty.spec, batch=batch, folder=folder, recipe=plan, adapter=adapter,
+            seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
+            command=console.command_line(), warnings=console.warned(), after=after, formats=settings["formats"],
+            filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity(),
+            scene=None if plan is None else lambda model: scene_images("photos", photos, model, plan, batch),
         )  # fmt: skip
         describe(job.run(), output.output)
+
+
+def check_place(output: OutputOptions) -> None:
+    """Refuse a folder that cannot be used whatever the settings are, before anything is loaded or downloaded."""
+    if stored_state(output.output) is None:
+        check_folder(output.output, {}, overwrite=output.overwrite)
 
 
 def save_frames(photos: Sequence[PhotoLike], folder: Path) -> None:

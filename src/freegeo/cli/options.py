@@ -40,7 +40,7 @@ class ModelOptions:
     seed: int = SEED
     """Seed of everything random."""
     reference: str | None = None
-    """Reference view of the frozen model: first, middle, saddle_balanced, saddle_sim_range; default: the model's."""
+    """Reference view of predictions: first, middle, saddle_balanced, saddle_sim_range; default: the model's rule."""
 
     def load(self) -> ReconstructionModel:
         """Load the model."""
@@ -56,15 +56,36 @@ class ModelOptions:
 
         return Compute.choose(self.device, self.precision)
 
-    def settings(self, model: ReconstructionModel) -> dict[str, object]:
-        """Return what the result depends on, for comparison with an existing folder."""
-        loaded = getattr(model, "loaded_from", None)
+    def build_empty(self) -> ReconstructionModel:
+        """Build the model without weights, which reads photos and knows its properties; checks the options first."""
+        from freegeo.models.catalog import build_empty
+        from freegeo.models.reference import require_rule
+
+        self.compute()
+        if self.reference is not None:
+            require_rule(self.reference)
+        return build_empty(self.model)
+
+    def weights(self) -> Path:
+        """Return the weight file, which is downloaded where needed."""
+        from freegeo.models.catalog import weights_file
+
+        return weights_file(self.model, self.checkpoint)
+
+    def checkpoint_identity(self) -> dict[str, str]:
+        """Return the name of the weight file and a fingerprint of its content."""
+        from freegeo.models.checkpoints import fingerprint
+
+        path = self.weights()
+        return {"file": path.name, "fingerprint": fingerprint(path)}
+
+    def identity(self) -> dict[str, object]:
+        """Return what an adapter depends on, for comparison with an existing folder."""
         return {
             "model": self.model,
-            "checkpoint": loaded.fingerprint if loaded else None,
+            "checkpoint": self.checkpoint_identity()["fingerprint"],
             "precision": self.compute().precision,
             "seed": self.seed,
-            "reference": self.reference or model.spec.reference,
         }
 
 

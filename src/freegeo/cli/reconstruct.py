@@ -30,5 +30,4 @@ def reconstruct(
         Folder of a saved adapter; without it the frozen model is used.
     """
     found = load_source(sources, photos)
-    loaded = model.load()
-    run_job(found, loaded, model, output, command="reconstruct", recipe=None, adapter=adapter, files=files)
+    run_job(found, model, output, command="reconstruct", recipe=None, adapter=adapter, files=files)

@@ -31,6 +31,4 @@ def run(
         Adapt before reconstructing; --no-adapt uses the frozen model.
     """
     found = load_source(sources, photos)
-    loaded = model.load()
-    plan = recipe.build(loaded.spec) if adapt else None
-    run_job(found, loaded, model, output, command="run", recipe=plan, files=files)
+    run_job(found, model, output, command="run", recipe=recipe if adapt else None, files=files)

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from freegeo.fusion.points import PointCloud
 
 DEFAULT_FORMATS = ("ply", "glb")
+KEPT_NAME = "kept.npz"
+"""File that says which pixels became points (`freegeo.export.kept`)."""
 MAX_TRACKS = 100_000
 """Default limit of the points of a COLMAP model."""
 

@@ -64,7 +64,7 @@ def load_model(name: str = DEFAULT_MODEL, *, checkpoint: str | Path | None = Non
 
     item = entry(name)
     build = _buildable(name)
-    path = checkpoints.find_file(Path(checkpoint)) if checkpoint else _packaged_or_downloaded(item)
+    path = weights_file(name, checkpoint)
     model = checkpoints.build_on_meta(build)
     checkpoints.load_weights(model, path, item.keys, name)
     model.eval()
@@ -73,6 +73,14 @@ def load_model(name: str = DEFAULT_MODEL, *, checkpoint: str | Path | None = Non
     )
     logger.info("%s loaded from %s; licence of the weights: %s", name, path, item.licence)
     return model
+
+
+def weights_file(name: str, checkpoint: str | Path | None = None) -> Path:
+    """Return the file of a model's weights: the local one given, the package's, or the hub's, which is downloaded."""
+    from freegeo.models import checkpoints
+
+    item = entry(name)
+    return checkpoints.find_file(Path(checkpoint)) if checkpoint else _packaged_or_downloaded(item)
 
 
 def download(name: str) -> Path:

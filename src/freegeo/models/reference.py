@@ -56,10 +56,15 @@ RULES: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
-def view_order(token_BSD: Tensor, rule: str) -> Tensor | None:
-    """Return the views (B, S) with the chosen one first and the others in input order; None for the input order."""
+def require_rule(rule: str) -> None:
+    """Raise UserError when there is no such rule."""
     if rule not in RULES:
         raise UserError(f"unknown reference-view rule '{rule}': choose one of {', '.join(RULES)}.")
+
+
+def view_order(token_BSD: Tensor, rule: str) -> Tensor | None:
+    """Return the views (B, S) with the chosen one first and the others in input order; None for the input order."""
+    require_rule(rule)
     views = token_BSD.shape[1]
     if rule == "first" or views < SMALLEST_SELECTION:
         return None

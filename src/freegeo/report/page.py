@@ -96,7 +96,7 @@ def render(result: Result) -> str:
 
 FILES = (
     "points.ply", "scene.glb", "mesh.ply", "colmap", "transforms.json", "depth", "prediction.npz",
-    "frozen/prediction.npz", "adapter", "reconstruction.json",
+    "frozen/prediction.npz", "kept.npz", "adapter", "reconstruction.json",
 )  # fmt: skip
 
 
@@ -226,16 +226,8 @@ def score_table(scores: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def filter_tables(result: Result) -> list[dict[str, Any]]:
-    """Pixels that the filters removed, per model; for the exported one, as the run stored them."""
-    noted = result.summary.get("filters")
-    tables = []
-    for stage in result.predictions:
-        removed, pixels = stage.removed, stage.keep.size
-        if stage is result.final and noted:
-            removed, pixels = noted["removed"], noted["pixels"]
-        if removed:
-            tables.append(_filter_table(stage.label, removed, pixels))
-    return tables
+    """Pixels that the filters removed, per model."""
+    return [_filter_table(stage.label, stage.removed, stage.keep.size) for stage in result.predictions if stage.removed]
 
 
 def _filter_table(label: str, removed: Mapping[str, int], pixels: int) -> dict[str, Any]:

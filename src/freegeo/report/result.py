@@ -16,6 +16,7 @@ import torch
 
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.formats import filter_reconstruction
+from freegeo.export.kept import load_kept
 from freegeo.export.reconstruction import FILE_NAME, Reconstruction
 from freegeo.files import FORMAT, read_json
 from freegeo.geometry.depth import depth_to_world, valid_depth
@@ -121,7 +122,7 @@ def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
         raise UserError(f"{folder}: written by a newer freegeo (format {summary['format']}). Update freegeo.")
     final = Reconstruction.load(folder)
     found = {"adapted" if summary.get("adapter") else "frozen": final}
-    if (folder / FROZEN_FOLDER / FILE_NAME).is_file():
+    if (folder / FROZEN_FOLDER / FILE_NAME).is_file() and not summary.get("rejected_adapter"):
         found = {"frozen": Reconstruction.load(folder / FROZEN_FOLDER), "adapted": final}
     if truth is None and (folder / TRUTH_FOLDER / FILE_NAME).is_file():
         truth = Reconstruction.load(folder / TRUTH_FOLDER)
@@ -129,7 +130,10 @@ def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
         if other.depth_z.shape != final.depth_z.shape:
             raise FreeGeoError(f"{folder}: reconstructions of different sizes cannot be compared. Run again.")
     reference = truth or final
-    stages = {key: _stage(key, value, reference, truth) for key, value in found.items()}
+    stages = {
+        key: _stage(key, value, reference, truth, folder if value is final else folder / FROZEN_FOLDER)
+        for key, value in found.items()
+    }
     if truth is not None:
         stages["truth"] = _truth_stage(truth)
     return Result(
@@ -188,10 +192,13 @@ def _valid(depth_z: np.ndarray) -> np.ndarray:
     return valid_depth(torch.from_numpy(depth_z)).numpy()
 
 
-def _stage(key: str, value: Reconstruction, reference: Reconstruction, truth: Reconstruction | None) -> Stage:
+def _stage(
+    key: str, value: Reconstruction, reference: Reconstruction, truth: Reconstruction | None, folder: Path
+) -> Stage:
     keep, removed = _valid(value.depth_z), {}
     if value.has_cameras:
-        keep, report = filter_reconstruction(value)
+        # Filtered here only where no command did, as after `Reconstruction.save`.
+        keep, report = load_kept(folder, value.depth_z.shape) or filter_reconstruction(value)
         removed = dict(report.removed)
     depth_z, T_cam_world = value.depth_z, value.T_cam_world
     if value.has_cameras and reference.has_cameras:

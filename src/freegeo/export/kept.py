@@ -1,0 +1,60 @@
+"""``kept.npz``: which pixels of a reconstruction the filters kept, beside the reconstruction that it belongs to.
+
+The log, the exported files, the report and the viewer all take it from here, so that they show the same points.
+
+| name | shape | type | meaning |
+|---|---|---|---|
+| `keep` | (S, H, W) | bool | pixels that become points |
+| `removed_by`, `removed` | (F,) | str, int64 | filters in the order they ran, and the pixels each removed |
+| `tolerance` | () | float64 | relative depth tolerance of the multi-view filter; NaN when it did not run |
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from freegeo import files
+from freegeo.errors import FreeGeoError
+from freegeo.export.base import KEPT_NAME
+from freegeo.fusion.filtering import FilterReport
+
+Filtered = tuple[np.ndarray, FilterReport]
+
+
+def save_kept(folder: Path, filtered: Filtered) -> Path:
+    """Write the result of `freegeo.export.formats.filter_reconstruction` and return the file's path."""
+    keep, report = filtered
+    arrays = {
+        "keep": keep,
+        "removed_by": np.array(list(report.removed), dtype=str),
+        "removed": np.array(list(report.removed.values()), dtype=np.int64),
+        "tolerance": np.float64(math.nan if report.tolerance is None else report.tolerance),
+    }
+    files.write_npz(folder / KEPT_NAME, arrays)
+    return folder / KEPT_NAME
+
+
+def load_kept(folder: Path, shape: tuple[int, ...]) -> Filtered | None:
+    """Read what `save_kept` wrote for depth maps of a shape (S, H, W); None when the folder has no such file.
+
+    FreeGeoError when the file is damaged or belongs to other maps.
+    """
+    file = folder / KEPT_NAME
+    if not file.is_file():
+        return None
+    try:
+        with np.load(file, allow_pickle=False) as content:
+            keep = content["keep"]
+            removed = dict(zip(content["removed_by"].tolist(), content["removed"].tolist(), strict=True))
+            tolerance = float(content["tolerance"])
+    except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, TypeError, EOFError, OSError) as error:
+        raise FreeGeoError(f"{file}: damaged file ({error}). Remove it and run again.") from None
+    if keep.shape != shape or keep.dtype != bool:
+        raise FreeGeoError(f"{file}: belongs to another reconstruction. Remove it and run again.")
+    tolerances = None if math.isnan(tolerance) else tolerance
+    return keep, FilterReport(pixels=keep.size, removed=removed, tolerance=tolerances)
