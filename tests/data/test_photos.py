@@ -10,8 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from freegeo.data import photos
-from freegeo.data.photos import MAX_PIXELS, evenly_spaced, load_photos, natural_key, unique_names
+from freegeo.data import image_files
+from freegeo.data.image_files import MAX_PIXELS
+from freegeo.data.photos import evenly_spaced, load_photos, natural_key, unique_names
 from freegeo.errors import UserError
 from png_header import png_header
 
@@ -296,20 +297,43 @@ def test_no_photos(tmp_path):
     assert "no such folder" in refusal(tmp_path / "missing")
 
 
-def test_other_files_in_the_folder(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("cameras.json", b"{}"),
+        ("IMG_0001.MOV", b"\0\0\0\x14ftypqt  "),
+        ("IMG_0001.AAE", b"<?xml"),
+        ("scan.pdf", b"%PDF-1.7\n"),
+        ("raw.dng", None),
+        ("empty", b""),
+    ],
+)
+def test_other_files_in_a_folder_or_pattern_are_left_out_and_named(tmp_path, caplog, name, content):
     save(tmp_path / "a.JPG")
-    (tmp_path / "notes.txt").write_text("")
-    message = refusal(tmp_path)
-    assert "1 of 2 files are no photos (first: notes.txt)" in message
-    assert f"'{tmp_path}/*.JPG'" in message
-    assert names(f"{tmp_path}/*.JPG") == ["a.JPG"]
+    if content is None:  # raw files are TIFF files whose first image is a thumbnail
+        save(tmp_path / name, format="TIFF")
+    else:
+        (tmp_path / name).write_bytes(content)
+    for source in (tmp_path, f"{tmp_path}/*"):
+        caplog.clear()
+        assert names(source) == ["a.JPG"]
+        assert f"1 of 2 files are no photos and are left out: {name}." in caplog.text
+    assert f"{name}: " in refusal([tmp_path / "a.JPG", tmp_path / name])
+
+
+def test_many_other_files_are_counted(tmp_path, caplog):
+    save(tmp_path / "a.png")
+    for k in range(8):
+        (tmp_path / f"{k}.txt").write_text("")
+    assert names(tmp_path) == ["a.png"]
+    assert "8 of 9 files are no photos and are left out: 0.txt, 1.txt, 2.txt, 3.txt, 4.txt and 3 more." in caplog.text
 
 
 def test_list_with_something_else_in_it(tmp_path):
     photo = save(tmp_path / "a.png")
     (tmp_path / "notes.txt").write_text("")
     assert "not a photo" in refusal([photo, tmp_path / "notes.txt"])
-    assert "no such file" in refusal([photo, tmp_path / "b.png"])
+    assert "b.png: the file cannot be opened (No such file" in refusal([photo, tmp_path / "b.png"])
     assert "a folder among several sources" in refusal([photo, tmp_path])
 
 
@@ -373,16 +397,16 @@ def test_image_above_the_pixel_limit_is_refused_by_its_header(tmp_path, side, re
 def test_limit_is_ours_not_pillows(tmp_path, monkeypatch, recwarn):
     save(tmp_path / "a.png")
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 600)
-    monkeypatch.setattr(photos, "MAX_PIXELS", 24 * 40)
+    monkeypatch.setattr(image_files, "MAX_PIXELS", 24 * 40)
     (photo,) = load_photos(tmp_path)
     assert (photo.read() == quarters()).all()
     assert not recwarn.list
-    monkeypatch.setattr(photos, "MAX_PIXELS", 24 * 40 - 1)
+    monkeypatch.setattr(image_files, "MAX_PIXELS", 24 * 40 - 1)
     assert "40 x 24 pixels are more than the limit" in refusal(tmp_path)
 
 
-def test_heic_without_the_extra_names_it(tmp_path, monkeypatch):
-    (tmp_path / "a.heic").write_bytes(b"")
+def test_heic_without_the_extra_names_it(tmp_path, encoded, monkeypatch):
+    (tmp_path / "a.jpg").write_bytes(encoded[".heic"])
     plain = builtins.__import__
 
     def without_heif(name, *args, **options):
@@ -398,4 +422,3 @@ def test_heic_with_the_extra(tmp_path, encoded):
     (tmp_path / "a.HEIC").write_bytes(encoded[".heic"])
     (photo,) = load_photos(tmp_path)
     assert photo.read().shape == (40, 48, 3)
-    assert photos.HEIF_SUFFIXES.isdisjoint(photos.PHOTO_SUFFIXES)

@@ -154,7 +154,7 @@ def test_videos_without_frames_or_pictures_are_refused(tmp_path):
     empty.write_bytes(whole[:cluster] + bytes(len(whole) - cluster))
     with pytest.raises(UserError, match="no frame that can be decoded"):
         load_video(empty, max_views=4)
-    sound = tmp_path / "sound.wav"
+    sound = tmp_path / "sound.mov"
     with av.open(str(sound), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")

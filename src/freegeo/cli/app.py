@@ -17,7 +17,7 @@ import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from freegeo import __version__
 from freegeo.cli import console
@@ -61,7 +61,7 @@ def build(config: Path | None = None) -> App:
         help=ABOUT,
         version=__version__,
         help_epilogue=GLOBAL,
-        config=None if config is None else cyclopts.config.Toml(config, must_exist=True),
+        config=None if config is None else cyclopts.config.Dict(read_config(config), source=str(config)),
         help_format="plaintext",
         result_action="return_value",
         suppress_keyboard_interrupt=False,
@@ -110,7 +110,7 @@ def run_command(arguments: Sequence[str]) -> int:
 def split_global(arguments: Sequence[str]) -> tuple[list[str], Path | None, bool]:
     """Take --config FILE and -v/--verbose off a command line; they may stand anywhere."""
     rest, config, verbose = [], None, False
-    tokens = iter(arguments)
+    tokens = iter(map(expand_home, arguments))
     for token in tokens:
         if token in ("-v", "--verbose"):
             verbose = True
@@ -122,6 +122,24 @@ def split_global(arguments: Sequence[str]) -> tuple[list[str], Path | None, bool
         else:
             rest.append(token)
     return rest, config, verbose
+
+
+def expand_home(token: str) -> str:
+    """Put the home folder for `~` in `--output=~/x`, where shells leave it as it is, and in quotes."""
+    option, equals, value = token.partition("=")
+    if equals and option.startswith("-"):
+        return f"{option}={os.path.expanduser(value)}"  # noqa: PTH111
+    return os.path.expanduser(token)  # noqa: PTH111
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Return the tables of a checked config file, with the home folder for `~`."""
+    with path.open("rb") as file:
+        tables = tomllib.load(file)
+    return {
+        name: {key: os.path.expanduser(value) if isinstance(value, str) else value for key, value in table.items()}  # noqa: PTH111
+        for name, table in tables.items()
+    }
 
 
 def checked_config(path: Path) -> Path:

@@ -49,7 +49,9 @@ def export(
     from freegeo.pipeline import FROZEN_FOLDER
 
     reconstruction = Reconstruction.load(source / FROZEN_FOLDER if frozen else source)
-    masks = filters.load_masks(reconstruction.names)
+    masks = filters.load_masks(
+        reconstruction.names, [(int(h), int(w)) for h, w in reconstruction.photo_hw], model_hw=reconstruction.image_hw
+    )
     wanted = None if masks is None else masks_for_model(reconstruction, masks)
     filtered = formats.filter_reconstruction(reconstruction, masks=wanted, settings=filters.settings())
     files = formats.export(

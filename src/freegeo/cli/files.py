@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from freegeo.errors import UserError
 from freegeo.export.base import DEFAULT_FORMATS
 from freegeo.export.formats import ALL, FORMATS, chosen_formats
 from freegeo.fusion.settings import FilterSettings
@@ -21,6 +20,8 @@ if TYPE_CHECKING:
 
     from freegeo.cli.options import OutputOptions
     from freegeo.types import PhotoLike
+
+Size = tuple[int, int]
 
 DEFAULTS = FilterSettings()
 
@@ -56,7 +57,8 @@ class FilterOptions:
     min_agreeing: int = DEFAULTS.min_agreeing
     """Other views that must agree with a pixel; more than 0 makes sparse, sure clouds."""
     masks: Path | None = None
-    """Folder with one mask image per photo (same name, any image type; white is wanted)."""
+    """Folder with a mask image per photo: white is kept, black left out. IMG_1.jpg has IMG_1.png, IMG_1.jpg.png or
+    IMG_1_mask.png."""
 
     def settings(self) -> FilterSettings:
         """Return the filter settings."""
@@ -64,13 +66,15 @@ class FilterOptions:
             drop_share=self.drop_share, flying=self.flying, multi_view=self.multi_view, min_agreeing=self.min_agreeing
         )
 
-    def load_masks(self, names: Sequence[str]) -> list[np.ndarray] | None:
-        """Read the masks of photos, by name."""
+    def load_masks(
+        self, names: Sequence[str], sizes_hw: Sequence[Size], *, model_hw: Size | None = None
+    ) -> list[np.ndarray] | None:
+        """Read the masks of photos, by name, at the photos' sizes (or at `model_hw`, the model's)."""
         if self.masks is None:
             return None
-        from freegeo.data.photos import load_masks
+        from freegeo.data.masks import load_masks
 
-        return load_masks(self.masks, names)
+        return load_masks(self.masks, names, sizes_hw, model_hw=model_hw)
 
 
 @Parameter(name="*")
@@ -94,12 +98,5 @@ class FileOptions:
         return chosen_formats([*there, *self.formats])
 
     def checked_masks(self, photos: Sequence[PhotoLike]) -> list[np.ndarray] | None:
-        """Read the masks and refuse other sizes than the photos', before anything is computed."""
-        masks = self.filters.load_masks([photo.name for photo in photos])
-        for photo, mask in zip(photos, masks or (), strict=bool(masks)):
-            if mask.shape != photo.size_hw:
-                raise UserError(
-                    f"the mask of {photo.name} is {mask.shape[1]} x {mask.shape[0]} pixels, the photo "
-                    f"{photo.size_hw[1]} x {photo.size_hw[0]}. Save masks at the size of the photos."
-                )
-        return masks
+        """Read the masks of photos, and refuse what cannot be used before anything is computed."""
+        return self.filters.load_masks([photo.name for photo in photos], [photo.size_hw for photo in photos])

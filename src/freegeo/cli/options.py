@@ -192,6 +192,8 @@ class PhotoOptions:
     """Most photos that are used; of more, as many are chosen evenly."""
     fps: float | None = None
     """Videos: take a frame this often per second; default: by sharpness and parallax."""
+    skip_bad: bool = False
+    """Leave out photos that cannot be read, with a warning, instead of stopping."""
 
 
 @Parameter(name="*")

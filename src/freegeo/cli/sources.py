@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
+from glob import has_magic
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,7 +27,32 @@ def load_source(sources: Sequence[str], photos: PhotoOptions) -> list[PhotoLike]
     require_sources(sources)
     if list(sources) == [DEMO]:
         return list(demo_scene(0, DEMO_DOMAIN).photos)[: photos.max_views]
-    return load_photos(sources[0] if len(sources) == 1 else list(sources), photos.max_views, fps=photos.fps)
+    if len(sources) > 1:
+        _refuse_several_scenes(sources)
+    source = sources[0] if len(sources) == 1 else list(sources)
+    return load_photos(source, photos.max_views, fps=photos.fps, skip_bad=photos.skip_bad)
+
+
+def _refuse_several_scenes(sources: Sequence[str]) -> None:
+    """Raise UserError when photos of a scene are given together with folders, patterns or videos."""
+    scenes = [source for source in sources if not _is_photo_file(source)]
+    if not scenes:
+        return
+    if len(scenes) < len(sources):
+        raise UserError(
+            f"{scenes[0]} is given together with photo files. Give photo files, or one folder, pattern or video."
+        )
+    raise UserError(
+        f"{len(scenes)} folders, patterns or videos are given, and each is a scene of its own. Give one of them, "
+        f"or make one adapter for all with `freegeo adapt {shlex.join(scenes)} -o ADAPTER`."
+    )
+
+
+def _is_photo_file(source: str) -> bool:
+    from freegeo.data.video import is_video
+
+    path = Path(source).expanduser()
+    return not path.is_dir() and not is_video(source) and (path.is_file() or not has_magic(source)) and source != DEMO
 
 
 def require_sources(sources: Sequence[str]) -> None:
@@ -46,10 +73,22 @@ def demo_scene(room: int, domain: str) -> Scene:
 
 
 def split_scenes(sources: Sequence[str]) -> list[list[str]]:
-    """Tell scenes apart: photo files together are one scene, every folder, pattern or video is one of its own."""
-    from freegeo.data.video import is_video
+    """Tell scenes apart: photo files together are one scene, every folder, pattern or video is one of its own.
 
+    A pattern that fits folders stands for these folders.
+    """
     require_sources(sources)
-    if all(Path(source).expanduser().is_file() and not is_video(source) for source in sources):
-        return [list(sources)]
-    return [[source] for source in sources]
+    named = [name for source in sources for name in _folders_of_pattern(source) or [source]]
+    files = [source for source in named if _is_photo_file(source)]
+    scenes = [[source] for source in named if source not in files]
+    return [files, *scenes] if files else scenes
+
+
+def _folders_of_pattern(source: str) -> list[str]:
+    """Return the folders that a pattern fits; nothing when it fits anything else."""
+    from freegeo.data.photos import matching
+
+    if not has_magic(source) or Path(source).expanduser().exists():
+        return []
+    matches = matching(source)
+    return [str(match) for match in matches] if all(match.is_dir() for match in matches) else []

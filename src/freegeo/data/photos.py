@@ -4,16 +4,34 @@ from __future__ import annotations
 
 import glob
 import logging
+import os
 import re
-import warnings
-from collections.abc import Generator, Iterable, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
+import shlex
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
+from freegeo.data.image_files import (
+    IMAGE_SUFFIXES,
+    KINDS,
+    UnreadableImageError,
+    deep_values,
+    holds_several,
+    is_blank,
+    is_image,
+    opened,
+    orientation,
+    pillow_limit_off,
+    rgb_on_white,
+    rgb_pixels,
+    scaled,
+    size_hw,
+    white_value,
+)
 from freegeo.data.video import is_video, load_video
 from freegeo.errors import UserError
 
@@ -27,14 +45,13 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff"})
-HEIF_SUFFIXES = frozenset({".heic", ".heif"})
-MAX_PIXELS = 150_000_000
-"""Largest photo that is read; beyond it a decoded photo takes more than half a gigabyte."""
 MAX_VIEWS = 32
 """Default limit of the photos that are used of a source."""
 _SYSTEM_FILES = frozenset({"thumbs.db", "desktop.ini"})
-_ORIENTATION_TAG, _SIDEWAYS = 0x0112, (5, 6, 7, 8)
+_NAMED = 5
+"""Most files that a warning names."""
+_READERS = 4
+"""Threads that decode photos when they are looked at."""
 
 
 @dataclass(frozen=True)
@@ -45,17 +62,18 @@ class Photo:
     path: Path
     size_hw: tuple[int, int]
     """Height and width after EXIF rotation."""
+    white: float | None = None
+    """Value that is white, of a file with more than 8 bits a channel; None: judged by the file's values."""
 
     def read(self) -> np.ndarray:
         """Decode to upright RGB (H, W, 3) uint8; transparent pixels become white."""
-        from PIL import ImageOps
-
-        with _opened(self.path) as image:
-            pixels = np.array(_to_rgb(ImageOps.exif_transpose(image)))
+        with opened(self.path) as image:
+            pixels = rgb_pixels(image, self.path, self.white)
         if pixels.shape[:2] != self.size_hw:
-            raise UserError(
-                f"{self.path}: the image is damaged (its header says {self.size_hw[1]} x {self.size_hw[0]} pixels, "
-                f"it has {pixels.shape[1]} x {pixels.shape[0]}). Replace it or take it out."
+            raise UnreadableImageError(
+                self.path,
+                f"the image is damaged (its header says {self.size_hw[1]} x {self.size_hw[0]} pixels, "
+                f"it has {pixels.shape[1]} x {pixels.shape[0]})",
             )
         return pixels
 
@@ -78,8 +96,13 @@ class MemoryPhoto:
         return self.pixels
 
 
-def load_photos(source: PhotoSource, max_views: int = MAX_VIEWS, *, fps: float | None = None) -> list[PhotoLike]:
+def load_photos(
+    source: PhotoSource, max_views: int = MAX_VIEWS, *, fps: float | None = None, skip_bad: bool = False
+) -> list[PhotoLike]:
     """Find the photos of a source and keep at most `max_views` of them, evenly spaced.
+
+    Each photo is decoded once here, so that all damaged ones are found before anything slow. Photos that are almost
+    black, white or of one colour, and files that had to be interpreted, are named in a warning.
 
     Args:
         source: a folder, a pattern such as `photos/*.jpg` (both in natural name order), a video, a photo, or a list of
@@ -88,15 +111,16 @@ def load_photos(source: PhotoSource, max_views: int = MAX_VIEWS, *, fps: float |
             used whole, whatever `max_views` is.
         max_views: most photos to keep; frames of a video are chosen by sharpness and parallax instead of evenly.
         fps: videos only: take a frame this often per second.
+        skip_bad: leave out photos that cannot be used, with a warning, instead of refusing all.
 
     Raises:
-        UserError: a file is missing, unreadable, no photo, or larger than `MAX_PIXELS`, or an image in memory is not
-            of the kind above; the message names it.
+        UserError: a file is missing, or photos are unreadable, no photos, or too large, or an image in memory is not
+            of the kind above; the message names all of them.
     """
     if max_views < 1:
         raise UserError(f"--max-views must be at least 1, got {max_views}.")
-    if isinstance(source, str | Path) and is_video(source):
-        return list(load_video(Path(source).expanduser(), fps=fps, max_views=max_views))
+    if isinstance(source, str | Path) and (path := _as_video(source)) is not None:
+        return list(load_video(path, fps=fps, max_views=max_views))
     if fps is not None:
         raise UserError("--fps is for videos; the source is none.")
     if isinstance(source, list | tuple) and source and all(map(_is_photo, source)):
@@ -105,9 +129,36 @@ def load_photos(source: PhotoSource, max_views: int = MAX_VIEWS, *, fps: float |
     if len(found) > max_views:
         logger.info("%d photos found, %d kept, evenly spaced (--max-views)", len(found), max_views)
         found = [found[i] for i in evenly_spaced(len(found), max_views)]
-    paths = [item for item in found if isinstance(item, Path)]
-    names = dict(zip(paths, unique_names(paths), strict=True))
-    return _named_once([Photo(names[item], item, _size_hw(item)) if isinstance(item, Path) else item for item in found])
+    files = [item for item in found if isinstance(item, Path)]
+    names = dict(zip(files, unique_names(files), strict=True))
+    looks = _looked_at(files, len(found), skip_bad=skip_bad)
+    photos: list[PhotoLike] = []
+    for item in found:
+        if not isinstance(item, Path):
+            photos.append(item)
+        elif item in looks:
+            photos.append(Photo(names[item], item, looks[item].size_hw, looks[item].white))
+    blank = {names[file] for file, look in looks.items() if look.blank}
+    blank |= {photo.name for photo in photos if isinstance(photo, MemoryPhoto) and is_blank(photo.pixels)}
+    if blank:
+        logger.warning(
+            "%d of %d photos are almost black, white or of one colour: %s. Look whether they are meant to be.",
+            len(blank), len(photos), some_of([photo.name for photo in photos if photo.name in blank]),
+        )  # fmt: skip
+    return _named_once(photos)
+
+
+def open_photos(files: Sequence[Path]) -> list[Photo]:
+    """Return photo files as photos, in their order; only the headers are read.
+
+    UserError when one is missing or no image.
+    """
+    return [Photo(name, path, _header(path)) for name, path in zip(unique_names(files), files, strict=True)]
+
+
+def _header(path: Path) -> tuple[int, int]:
+    with opened(path) as image:
+        return size_hw(image, orientation(image))
 
 
 def _is_photo(item: Any) -> TypeGuard[PhotoLike]:
@@ -115,17 +166,26 @@ def _is_photo(item: Any) -> TypeGuard[PhotoLike]:
 
 
 def _named_once(photos: Sequence[PhotoLike]) -> list[PhotoLike]:
-    """Return the photos; UserError when two have the same name."""
+    """Return the photos; UserError when two have the same name, or one has a name that leads out of a folder."""
     names = [photo.name for photo in photos]
     twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
     if twice is not None:
         raise UserError(f"two photos have the name {twice}. Name each photo once.")
+    outside = next((name for name in names if PurePath(name).is_absolute() or ".." in PurePath(name).parts), None)
+    if outside is not None:
+        raise UserError(f"a photo has the name {outside}. Names become files below a folder: leave out '/' and '..'.")
     return list(photos)
 
 
 def evenly_spaced(count: int, keep: int) -> list[int]:
     """Return `keep` distinct indices of `range(count)`, first and last included (the first alone for keep = 1)."""
     return [round(i) for i in np.linspace(0, count - 1, min(count, keep))]
+
+
+def some_of(names: Sequence[str]) -> str:
+    """Return names as text, the first few of many."""
+    more = len(names) - _NAMED
+    return ", ".join(names) if more <= 0 else f"{', '.join(names[:_NAMED])} and {more} more"
 
 
 def find_photos(source: PhotoSource) -> Sequence[Path | PhotoLike]:
@@ -139,7 +199,8 @@ def find_photos(source: PhotoSource) -> Sequence[Path | PhotoLike]:
             f"photos are a folder, a pattern, a video, or a list of files or images, not {_kind(source)}. "
             "See freegeo.load_photos."
         )
-    return [_listed(item, position) for position, item in enumerate(source)] or _no_photos("the list of photos")
+    listed = [_listed(item, position) for position, item in enumerate(source)]
+    return listed or _no_photos("the list of photos", [])
 
 
 def _found_files(source: str | Path) -> list[Path]:
@@ -147,20 +208,97 @@ def _found_files(source: str | Path) -> list[Path]:
         raise UserError("the name of the photos is empty. Give a folder of photos, a glob or a photo.")
     path = Path(source).expanduser()
     if path.is_dir():
-        return _folder_photos(path)
+        return _photos_among(str(path), _by_name(path.iterdir())) or _no_photos(str(path), _sub_folders(path))
     if path.is_file():
-        return [_checked_file(path)]
+        return [path]
     if glob.has_magic(str(source)):
-        matches = [Path(found) for found in glob.glob(str(path), recursive=True)]  # noqa: PTH207 (absolute patterns too)
-        return sorted((_checked_file(p) for p in matches if p.is_file()), key=natural_key) or _no_photos(str(source))
+        matches = matching(source)
+        folders = [match for match in matches if match.is_dir()]
+        return _photos_among(str(source), matches) or _no_photos(str(source), folders)
     raise UserError(f"{source}: no such folder, file or pattern. Give a folder of photos, a glob or a photo.")
+
+
+def matching(pattern: str | Path) -> list[Path]:
+    """Return what a pattern fits, in natural order; folders that exist are names, whatever brackets they have."""
+    path = Path(pattern).expanduser()
+    folder = next(parent for parent in path.parents if parent.is_dir())
+    found = glob.glob(str(path.relative_to(folder)), root_dir=folder, recursive=True)  # noqa: PTH207 (skips hidden files)
+    return _by_name(folder / name for name in found)
+
+
+def _by_name(paths: Iterable[Path]) -> list[Path]:
+    return sorted(paths, key=natural_key)
+
+
+def _photos_among(where: str, paths: Sequence[Path]) -> list[Path]:
+    """Return the photos among files of a folder or pattern; others are left out with a warning, unless all are."""
+    # A link whose file is missing is a photo that cannot be read, which the user should know.
+    files = [path for path in paths if path.is_file() or path.is_symlink()]
+    files = [path for path in files if not path.is_dir() and not _is_hidden(path)]
+    photos = [
+        path for path in files if path.suffix.lower() in IMAGE_SUFFIXES or (not is_video(path) and is_image(path))
+    ]
+    taken = set(photos)
+    strangers = [path.name for path in files if path not in taken]
+    videos = [path for path in files if is_video(path)]
+    if not photos and videos:
+        raise UserError(
+            f"{where}: no photos, but {len(videos)} video{'s' if len(videos) > 1 else ''}. Give one video by its name, "
+            f"such as {shlex.quote(str(videos[0]))}."
+        )
+    if photos and strangers:
+        logger.warning(
+            "%s: %d of %d files are no photos and are left out: %s.",
+            where, len(strangers), len(files), some_of(strangers),
+        )  # fmt: skip
+    return photos
+
+
+def _is_hidden(path: Path) -> bool:
+    return path.name.startswith(".") or path.name.lower() in _SYSTEM_FILES
+
+
+def _no_photos(where: str, folders: Sequence[Path]) -> list[Path]:
+    """Say what there is instead of photos."""
+    counts = {folder: sum(_named_image(path) for path in folder.iterdir()) for folder in folders}
+    full = [f"{folder} ({count})" for folder, count in counts.items() if count]
+    if not full:
+        raise UserError(f"{where}: no photos found. Supported are {KINDS}.")
+    raise UserError(
+        f"{where}: no photos found there, but in {len(full)} folders: {some_of(full)}. Give one of them; `freegeo "
+        "adapt` takes several, each as a scene."
+    )
+
+
+def _named_image(path: Path) -> bool:
+    return path.suffix.lower() in IMAGE_SUFFIXES and path.is_file() and not _is_hidden(path)
+
+
+def _sub_folders(folder: Path) -> list[Path]:
+    """Return the folders one and two levels below a folder."""
+    below = [*folder.glob("*"), *folder.glob("*/*")]
+    return _by_name(path for path in below if path.is_dir() and not _is_hidden(path))
+
+
+def _as_video(source: str | Path) -> Path | None:
+    """Return the video that a source is, also as the one that a pattern fits; None for any other source."""
+    path = Path(source).expanduser()
+    if not is_video(path) or path.is_dir():
+        return None
+    if path.exists() or not glob.has_magic(str(source)):
+        return path
+    matches = [match for match in matching(source) if match.is_file()]
+    return matches[0] if len(matches) == 1 else None
 
 
 def _listed(item: Any, position: int) -> Path | PhotoLike:
     """Return an element of a list of photos as a file or a photo in memory."""
     name = f"image-{position:03d}"
     if isinstance(item, str | Path):
-        return _checked_file(Path(item).expanduser())
+        path = Path(item).expanduser()
+        if path.is_dir():
+            raise UserError(f"{path}: a folder among several sources. Give one folder alone, or a list of photo files.")
+        return path
     if isinstance(item, np.ndarray):
         if item.dtype != np.uint8 or item.ndim != 3 or item.shape[2] != 3 or not item.size:
             raise UserError(
@@ -169,9 +307,7 @@ def _listed(item: Any, position: int) -> Path | PhotoLike:
             )
         return MemoryPhoto(name, item.copy())
     if _is_pillow(item):
-        from PIL import ImageOps
-
-        return MemoryPhoto(name, np.array(_to_rgb(ImageOps.exif_transpose(item))))
+        return MemoryPhoto(name, rgb_pixels(item, name))
     if _is_photo(item):
         return item
     raise UserError(
@@ -195,127 +331,109 @@ def natural_key(path: Path) -> list[tuple[int, int | str]]:
 
 
 def unique_names(paths: Sequence[Path]) -> list[str]:
-    """Return file names, with as many parent folders as needed to make them unique."""
-    for depth in range(1, max((len(p.parts) for p in paths), default=1) + 1):
-        names = ["/".join(path.parts[-depth:]) for path in paths]
+    """Return file names, with as many parent folders as needed to make them unique; never absolute, never with `..`.
+
+    UserError when a file is listed twice.
+    """
+    # Made absolute without following links, whose targets would give names that the user does not know.
+    absolute = [Path(os.path.abspath(path)) for path in paths]  # noqa: PTH100
+    for depth in range(1, max((len(path.parts) for path in absolute), default=1) + 1):
+        names = ["/".join(path.relative_to(path.anchor).parts[-depth:]) for path in absolute]
         if len(set(names)) == len(names):
             return names
-    twice = next(str(p) for i, p in enumerate(paths) if p in paths[:i])
+    twice = next(str(paths[i]) for i, path in enumerate(absolute) if path in absolute[:i])
     raise UserError(f"{twice} is listed twice. Name each photo once.")
 
 
-def _no_photos(where: str) -> list[Path]:
-    raise UserError(f"{where}: no photos found. Supported are {_supported()}.")
+# -- looking at the pixels
 
 
-def _supported() -> str:
-    return "JPEG, PNG, WebP and TIFF (HEIC with pip install 'freegeo[heif]')"
+@dataclass(frozen=True)
+class _Look:
+    """What was seen when a photo was decoded for the first time."""
+
+    size_hw: tuple[int, int]
+    blank: bool
+    several: bool
+    """Whether the file holds further pictures."""
+    exif_damaged: bool = False
+    white: float | None = None
+    """Value that is white, of a file with more than 8 bits a channel."""
+    largest: int | None = None
+    """Largest value of a file with 16-bit integers."""
 
 
-def _folder_photos(folder: Path) -> list[Path]:
-    files = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")]
-    files = sorted((p for p in files if p.name.lower() not in _SYSTEM_FILES), key=natural_key)
-    strangers = [p for p in files if p.suffix.lower() not in PHOTO_SUFFIXES | HEIF_SUFFIXES]
-    if strangers and len(strangers) < len(files):
-        raise UserError(
-            f"{folder}: {len(strangers)} of {len(files)} files are no photos (first: {strangers[0].name}). "
-            f"Move them away, or choose the photos with a pattern such as '{folder}/*{_photo_suffix(files)}'."
+def _looked_at(files: Sequence[Path], count: int, *, skip_bad: bool) -> dict[Path, _Look]:
+    """Decode files; UserError names all that cannot be used, of `count` photos, unless they are left out."""
+    with pillow_limit_off(), ThreadPoolExecutor(_READERS) as pool:
+        results = dict(zip(files, pool.map(_look, files), strict=True))
+    looks = {file: result for file, result in results.items() if isinstance(result, _Look)}
+    bad = [result for result in results.values() if isinstance(result, UnreadableImageError)]
+    if bad and (not skip_bad or len(bad) == count):
+        raise _refusal(bad, count)
+    if bad:
+        logger.warning("%d of %d photos cannot be used and are left out: %s.", len(bad), count, _reasons(bad))
+    if several := [file.name for file, look in looks.items() if look.several]:
+        logger.warning(
+            "only the first picture is used of files that hold several: %s. Save an animation as a video to use all.",
+            some_of(several),
         )
-    return [p for p in files if p not in strangers] or _no_photos(str(folder))
-
-
-def _photo_suffix(files: Sequence[Path]) -> str:
-    return next(p.suffix for p in files if p.suffix.lower() in PHOTO_SUFFIXES | HEIF_SUFFIXES)
-
-
-def _checked_file(path: Path) -> Path:
-    if path.is_dir():
-        raise UserError(f"{path}: a folder among several sources. Give one folder alone, or a list of photo files.")
-    if not path.is_file():
-        raise UserError(f"{path}: no such file. Check the name.")
-    if path.suffix.lower() not in PHOTO_SUFFIXES | HEIF_SUFFIXES:
-        raise UserError(f"{path}: not a photo. Supported are {_supported()}.")
-    return path
-
-
-def load_masks(folder: Path, names: Sequence[str]) -> list[np.ndarray]:
-    """Read one mask (H, W) uint8 for each photo name from a folder, by the name without its ending.
-
-    UserError when the folder or a mask is missing or unreadable.
-    """
-    if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder of masks.")
-    files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in PHOTO_SUFFIXES}
-    missing = [name for name in names if Path(name).stem not in files]
-    if missing:
-        raise UserError(
-            f"{folder}: {len(missing)} of {len(names)} photos have no mask (first: {missing[0]}). Name each mask as "
-            "its photo, or leave --masks out."
+    if damaged := [file.name for file, look in looks.items() if look.exif_damaged]:
+        logger.warning(
+            "damaged EXIF data do not say how these photos are turned: %s. Look whether they are upright.",
+            some_of(damaged),
         )
-    masks = []
-    for name in names:
-        with _opened(files[Path(name).stem]) as image:
-            masks.append(np.array(image.convert("L")))
-    return masks
+    return _with_common_white(looks)
 
 
-@contextmanager
-def _opened(path: Path) -> Generator:
-    from PIL import Image, UnidentifiedImageError
-
-    if path.suffix.lower() in HEIF_SUFFIXES:
-        _register_heif(path)
+def _look(file: Path) -> _Look | UnreadableImageError:
+    if is_video(file):
+        return UnreadableImageError(file, "a video among photos, which has to be given alone")
     try:
-        with warnings.catch_warnings():
-            # Pillow warns at a limit of its own, and refuses at twice that; only `MAX_PIXELS` applies here.
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(path)
-        with image:
-            if image.width * image.height > MAX_PIXELS:
-                raise _too_large(path, f"{image.width} x {image.height} pixels are")
-            yield image
-    except UserError:
-        raise
-    except UnidentifiedImageError:
-        raise UserError(f"{path}: the file is not a readable image. Replace it or take it out.") from None
-    except Image.DecompressionBombError:
-        raise _too_large(path, "its pixels are") from None
-    except (OSError, SyntaxError, EOFError, ValueError, RuntimeError) as error:
-        # The decoders of Pillow and of its plug-ins raise different errors for damaged files.
-        reason = " ".join(str(error).split())
-        raise UserError(f"{path}: the image is damaged or truncated ({reason}). Replace it or take it out.") from None
+        with opened(file) as image:
+            several = holds_several(image)
+            values = deep_values(image, file)
+            if values is None:
+                turn = orientation(image)
+                seen_hw = size_hw(image, turn)
+                # At an eighth of its size a JPEG is decoded in a third of the time, and the same damage is found.
+                image.draft(None, (max(1, image.width // 8), max(1, image.height // 8)))
+                return _Look(seen_hw, is_blank(rgb_pixels(image, file)), several, exif_damaged=turn is None)
+        white = white_value(values, file)
+    except UnreadableImageError as bad:
+        return bad
+    height, width = values.shape[:2]
+    largest = int(values[..., :3].max()) if values.dtype == np.uint16 else None
+    return _Look((height, width), is_blank(rgb_on_white(scaled(values, white))), several, white=white, largest=largest)
 
 
-def _too_large(path: Path, what: str) -> UserError:
-    limit = MAX_PIXELS // 1_000_000
-    return UserError(f"{path}: {what} more than the limit of {limit} megapixels. Shrink the photo first.")
+def _with_common_white(looks: dict[Path, _Look]) -> dict[Path, _Look]:
+    """Choose white for 16-bit files of one kind together, so that a dark photo stays darker than the others."""
+    result = dict(looks)
+    for depths in ((8,), (10, 12), (14, 16)):
+        group = {f: look for f, look in looks.items() if look.largest is not None and look.white == 2 ** depths[-1] - 1}
+        if not group:
+            continue
+        bits = next(bits for bits in depths if max(look.largest or 0 for look in group.values()) < 2**bits)
+        result |= {file: replace(look, white=2.0**bits - 1) for file, look in group.items()}
+        if bits < 16:
+            logger.warning(
+                "photos that store %d bits in 16-bit files are brightened accordingly: %s.",
+                bits, some_of([file.name for file in group]),
+            )  # fmt: skip
+    return result
 
 
-def _register_heif(path: Path) -> None:
-    try:
-        import pillow_heif
-    except ImportError:
-        raise UserError(f"{path}: HEIC photos need an extra: pip install 'freegeo[heif]'.") from None
-    pillow_heif.register_heif_opener()
+def _refusal(bad: Sequence[UnreadableImageError], count: int) -> UserError:
+    if count == 1:
+        return bad[0]
+    if len(bad) == 1:
+        return UserError(f"{bad[0].path}: {bad[0].reason}. Replace it, or leave it out with --skip-bad.")
+    hint = "Replace them" if len(bad) == count else "Replace them, or leave them out with --skip-bad"
+    return UserError(f"{len(bad)} of {count} photos cannot be used: {_reasons(bad)}. {hint}.")
 
 
-def _size_hw(path: Path) -> tuple[int, int]:
-    with _opened(path) as image:
-        # Pillow gives the size of a TIFF as it is after rotation, of everything else as it is stored.
-        turned = image.format != "TIFF" and image.getexif().get(_ORIENTATION_TAG) in _SIDEWAYS
-        return (image.width, image.height) if turned else (image.height, image.width)
-
-
-def _to_rgb(image):
-    from PIL import Image
-
-    if image.mode in ("I;16", "I;16B", "I;16L", "I"):
-        # Pillow clips 16-bit values when it converts them; photos need them scaled.
-        return Image.fromarray(
-            (np.asarray(image, dtype=np.float64) / 257).round().clip(0, 255).astype(np.uint8)
-        ).convert("RGB")
-    if "A" in image.getbands() or "transparency" in image.info:
-        image = image.convert("RGBA")
-        white = Image.new("RGBA", image.size, "white")
-        return Image.alpha_composite(white, image).convert("RGB")
-    return image.convert("RGB")
+def _reasons(bad: Sequence[UnreadableImageError]) -> str:
+    """Name all bad photos, those with the same reason together."""
+    reasons = list(dict.fromkeys(image.reason for image in bad))
+    return "; ".join(f"{', '.join(str(i.path) for i in bad if i.reason == reason)}: {reason}" for reason in reasons)

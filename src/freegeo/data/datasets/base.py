@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from freegeo.data.image_files import FORMATS
 from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError, UserError
 
@@ -91,7 +92,7 @@ def read_gray(path: Path) -> np.ndarray:
     """Read a one-channel 8-bit or 16-bit image as stored, (H, W) integers; FreeGeoError when it has more channels."""
     from PIL import Image
 
-    with Image.open(path) as image:
+    with Image.open(path, formats=FORMATS) as image:
         values = np.array(image)
     if values.ndim != 2:
         raise FreeGeoError(f"{path}: a one-channel image was expected, this one has shape {values.shape}.")

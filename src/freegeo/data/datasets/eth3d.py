@@ -19,7 +19,7 @@ import torch
 
 from freegeo.data.colmap_files import read_cameras, read_images
 from freegeo.data.datasets.base import Dataset, DatasetConstants, existing, read_gray, require_folder
-from freegeo.data.photos import load_photos
+from freegeo.data.photos import open_photos
 from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError
 
@@ -73,7 +73,7 @@ def load_scene(root: Path, name: str) -> Scene:
     masks = folder / "masks_for_images" / "dslr_images"
     return Scene(
         name=name,
-        photos=tuple(load_photos(files, max_views=len(files))),
+        photos=tuple(open_photos(files)),
         T_cam_world=torch.tensor(np.stack([image.T_cam_world for image in images]), dtype=torch.float32),
         K=torch.tensor(np.stack([cameras[image.camera].K for image in images]), dtype=torch.float32),
         truth=SceneTruth(

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from freegeo.data.datasets.base import Dataset, DatasetConstants, existing, read_gray, require_folder
-from freegeo.data.photos import load_photos
+from freegeo.data.photos import open_photos
 from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError, UserError
 
@@ -49,7 +49,7 @@ def load_scene(root: Path, name: str) -> Scene:
     if not posed:
         raise FreeGeoError(f"{folder} holds no frame with both an image and a pose.")
     files, frames = [files[i] for i in posed], [frames[i] for i in posed]
-    photos = load_photos(files, max_views=len(files))
+    photos = open_photos(files)
     T = np.stack([_read_pose(folder / "pose" / f"{frame}.npy") for frame in frames])
     return Scene(
         name=name,

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from freegeo.data.datasets.base import Dataset, DatasetConstants, existing, read_gray, require_folder
-from freegeo.data.photos import load_photos
+from freegeo.data.photos import open_photos
 from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError
 
@@ -49,7 +49,7 @@ def load_scene(root: Path, name: str) -> Scene:
     poses = np.stack([_read_pose(_part(stem, "pose.txt")) for stem in stems])
     return Scene(
         name=name,
-        photos=tuple(load_photos([_part(stem, "color.png") for stem in stems], max_views=len(stems))),
+        photos=tuple(open_photos([_part(stem, "color.png") for stem in stems])),
         T_cam_world=torch.tensor(np.linalg.inv(poses), dtype=torch.float32),
         K=torch.tensor(K_COLOR).repeat(len(stems), 1, 1),
         truth=SceneTruth(
