@@ -113,6 +113,25 @@ def test_config_sets_switches(caught, tmp_path, spelling):
     assert str(output.output) == "from-file"
 
 
+@pytest.mark.parametrize("given", [["--output=~/x"], ["--output", "~/x"], ["-o", "~/x"], ["-o=~/x"]])
+def test_the_home_folder_may_be_short_in_every_option(caught, tmp_path, monkeypatch, given):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert main(["run", "~/photos", *given, "--checkpoint=~/w.pt", "--masks", "~/m"]) == 0
+    (sources, _), ((_, _, model, output), options) = caught
+    assert sources == (f"{tmp_path}/photos",)
+    assert output.output == tmp_path / "x"
+    assert model.checkpoint == tmp_path / "w.pt"
+    assert options["files"].filters.masks == tmp_path / "m"
+
+
+def test_the_home_folder_may_be_short_in_a_config(caught, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert main(["run", "x", "--config", config(tmp_path, '[run]\noutput = "~/x"\nsteps = 3\n')]) == 0
+    (_, _, _, output), options = caught[1]
+    assert output.output == tmp_path / "x"
+    assert options["recipe"].steps == 3
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -1,10 +1,13 @@
 """Every mistake is one clear sentence with exit code 2, every failure one with 1, and nothing is half-written."""
 
+import json
 import pickle
+import shlex
 from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import load_file, save_file
 
 from cli.conftest import QUICK
@@ -41,15 +44,16 @@ def bad_source(kind: str, folder: Path, source: Path) -> tuple[Path | str, str]:
     if kind == "too large":
         (folder / "3.png").write_bytes(png_header(20_000, 20_000))
         return folder, "more than the limit of 150 megapixels"
-    assert kind == "other files"
-    (folder / "notes.txt").write_text("")
-    return folder, "1 of 5 files are no photos (first: notes.txt)"
+    assert kind == "several"
+    (folder / "1.png").write_text("no image")
+    (folder / "2.png").write_bytes((folder / "2.png").read_bytes()[:2000])
+    return folder, "2 of 4 photos cannot be used: "
 
 
 @pytest.mark.parametrize("command", ["run", "adapt"])
 @pytest.mark.parametrize(
     "kind",
-    ["missing", "pattern", "empty", "one photo", "two photos", "not an image", "truncated", "too large", "other files"],
+    ["missing", "pattern", "empty", "one photo", "two photos", "not an image", "truncated", "too large", "several"],
 )
 def test_sources_that_cannot_be_used(freegeo, photo_folder, tiny, tmp_path, command, kind):
     source, words = bad_source(kind, tmp_path / "photos", photo_folder)
@@ -57,6 +61,20 @@ def test_sources_that_cannot_be_used(freegeo, photo_folder, tiny, tmp_path, comm
     assert outcome.code == 2, outcome.err
     assert words in outcome.sentence()
     assert not (tmp_path / "out").exists()
+
+
+def test_bad_photos_and_other_files_are_left_out_and_said_in_the_result(freegeo, photo_folder, tiny, tmp_path):
+    folder = copies(tmp_path / "photos", photo_folder, 4)
+    (folder / "2.png").write_bytes((folder / "2.png").read_bytes()[:2000])
+    (folder / "notes.txt").write_text("")
+    outcome = freegeo("reconstruct", folder, "-o", tmp_path / "out", *tiny, "--skip-bad")
+    assert outcome.code == 0, outcome.err
+    summary = json.loads((tmp_path / "out" / "reconstruction.json").read_text())
+    assert summary["images"] == ["0.png", "1.png", "3.png"]
+    left_out, bad = summary["warnings"][:2]
+    assert left_out == f"{folder}: 1 of 5 files are no photos and are left out: notes.txt."
+    assert bad.startswith(f"1 of 4 photos cannot be used and are left out: {folder}/2.png: the image is damaged")
+    assert f"warning: {left_out}" in outcome.err
 
 
 def test_no_source_is_not_the_working_folder(freegeo, photo_folder, tiny, tmp_path, monkeypatch):
@@ -69,12 +87,32 @@ def test_no_source_is_not_the_working_folder(freegeo, photo_folder, tiny, tmp_pa
 
 
 def test_one_scene_per_run(freegeo, photo_folder, tiny, tmp_path):
-    outcome = freegeo("run", photo_folder, tmp_path, "-o", tmp_path / "out", *tiny)
-    assert outcome.code == 2
-    assert "a folder among several sources" in outcome.sentence()
+    other = copies(tmp_path / "other", photo_folder, 3)
+    for command in ("run", "reconstruct"):
+        for sources in ((photo_folder, other), ("a.mp4", "b.ts"), (f"{photo_folder}/*.png", other)):
+            outcome = freegeo(command, *sources, "-o", tmp_path / "out", *tiny)
+            assert outcome.code == 2
+            assert "2 folders, patterns or videos are given" in outcome.sentence()
+            suggested = f"freegeo adapt {shlex.join(map(str, sources))} -o ADAPTER"
+            assert suggested in outcome.sentence()
+    mixed = freegeo("run", photo_folder / "0.png", other, "-o", tmp_path / "out", *tiny)
+    assert mixed.code == 2
+    assert f"{other} is given together with photo files" in mixed.sentence()
     twice = freegeo("adapt", photo_folder, photo_folder, "-o", tmp_path / "out", *tiny)
     assert twice.code == 2
     assert "given twice" in twice.sentence()
+
+
+def test_masks_that_cannot_be_used_are_refused_before_anything_is_written(freegeo, photo_folder, tiny, tmp_path):
+    (tmp_path / "masks").mkdir()
+    for k, level in enumerate((0, 0, 0, 128)):
+        Image.new("L", (64, 48), level).save(tmp_path / "masks" / f"{k}.png")
+    for words in ("neither black nor white", "select nothing"):
+        outcome = freegeo("run", photo_folder, "-o", tmp_path / "out", *tiny, *QUICK, "--masks", tmp_path / "masks")
+        assert outcome.code == 2
+        assert words in outcome.sentence()
+        Image.new("L", (64, 48), 0).save(tmp_path / "masks" / "3.png")
+    assert not (tmp_path / "out").exists()
 
 
 # -- models and checkpoints

@@ -22,6 +22,16 @@ def test_files_are_one_scene_and_folders_are_several(tmp_path):
     assert sources.split_scenes(names) == [names]
     assert sources.split_scenes([str(tmp_path), "x/*.jpg"]) == [[str(tmp_path)], ["x/*.jpg"]]
     assert sources.split_scenes(["demo"]) == [["demo"]]
+    assert sources.split_scenes([*names, str(tmp_path), "walk.mp4"]) == [names, [str(tmp_path)], ["walk.mp4"]]
+
+
+def test_a_pattern_that_fits_folders_stands_for_these(tmp_path):
+    for name in ("b", "a", "c[1]"):
+        (tmp_path / name).mkdir()
+    assert sources.split_scenes([f"{tmp_path}/*"]) == [[str(tmp_path / name)] for name in ("a", "b", "c[1]")]
+    assert sources.split_scenes([str(tmp_path / "c[1]")]) == [[str(tmp_path / "c[1]")]]
+    (tmp_path / "d.png").write_bytes(b"")
+    assert sources.split_scenes([f"{tmp_path}/*"]) == [[f"{tmp_path}/*"]]
 
 
 @pytest.mark.parametrize("given", [[], [""]])

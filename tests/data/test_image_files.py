@@ -1,4 +1,4 @@
-"""Image files of every kind: told by content, upright whatever their EXIF data say besides, with the right brightness."""
+"""Image files of every kind: told by content, upright whatever else their EXIF data say, with the right brightness."""
 
 import struct
 
@@ -64,7 +64,9 @@ def test_spider_and_raw_files_are_no_photos(tmp_path):
 def test_only_the_first_picture_of_an_animation_is_used_and_that_is_said(tmp_path, caplog):
     first, second = Image.fromarray(quarters()), Image.fromarray(255 - quarters())
     for name in ("a.gif", "b.webp", "c.png", "d.tif"):
-        first.save(tmp_path / name, save_all=True, append_images=[second], **({"lossless": True} if "w" in name else {}))
+        first.save(
+            tmp_path / name, save_all=True, append_images=[second], **({"lossless": True} if "w" in name else {})
+        )
         assert np.abs(read(tmp_path / name).astype(int) - quarters()).max() <= 2
         assert f"only the first picture is used of files that hold several: {name}" in caplog.text
     caplog.clear()
@@ -97,6 +99,7 @@ SIX = (ORIENTATION, 3, 1, struct.pack("<HH", 6, 0))
     ],
     ids=["negative resolution", "date as float", "pointer out of the block", "unknown type"],
 )
+@pytest.mark.filterwarnings("ignore::UserWarning:PIL")
 def test_senseless_fields_do_not_keep_a_photo_from_being_turned(tmp_path, caplog, suffix, block):
     stored = Image.fromarray(np.ascontiguousarray(STORED[6](quarters())))
     stored.save(tmp_path / f"a{suffix}", exif=block, quality=95)
@@ -113,6 +116,7 @@ def test_damaged_exif_is_no_damaged_image_but_said(tmp_path, caplog, block):
     assert "damaged EXIF data do not say how these photos are turned: a.webp" in caplog.text
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning:PIL")
 @pytest.mark.parametrize("suffix", [".jpg", ".tif"])
 def test_photos_with_random_bytes_in_their_exif_are_read(tmp_path, suffix):
     exif = Image.Exif()

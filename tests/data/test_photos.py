@@ -12,7 +12,7 @@ from PIL import Image
 
 from freegeo.data import image_files
 from freegeo.data.image_files import MAX_PIXELS
-from freegeo.data.photos import evenly_spaced, load_photos, natural_key, unique_names
+from freegeo.data.photos import MemoryPhoto, evenly_spaced, load_photos, natural_key, unique_names
 from freegeo.errors import UserError
 from png_header import png_header
 
@@ -84,9 +84,24 @@ def test_pattern_list_and_single_file(tmp_path):
     assert names(f"{tmp_path}/**/*.png") == ["1.png", "2.png", "11.png", "3.png"]
 
 
-def test_folder_with_brackets_in_its_name_is_a_folder(tmp_path):
-    save(tmp_path / "day[1]" / "a.png")
-    assert names(tmp_path / "day[1]") == ["a.png"]
+@pytest.mark.parametrize("folder", ["day[1]", "scan [final]", "a*b", "what?", "x/[y]"])
+def test_a_folder_that_exists_is_a_name_whatever_its_characters(tmp_path, folder):
+    save(tmp_path / folder / "a.png")
+    save(tmp_path / folder / "b[2].jpg")
+    save(tmp_path / "day1" / "other.png")
+    assert names(tmp_path / folder) == ["a.png", "b[2].jpg"]
+    assert names(f"{tmp_path}/{folder}/*") == ["a.png", "b[2].jpg"]
+    assert names(f"{tmp_path}/{folder}/?.png") == names(f"{tmp_path}/{folder}/[ab].png") == ["a.png"]
+    assert names(f"{tmp_path}/{folder}/b[2].jpg") == ["b[2].jpg"]
+
+
+def test_patterns_relative_to_the_working_folder(tmp_path, monkeypatch):
+    save(tmp_path / "p" / "a.png")
+    (tmp_path / "q").mkdir()
+    monkeypatch.chdir(tmp_path / "q")
+    assert names("../p/*.png") == names("../*/a.png") == ["a.png"]
+    monkeypatch.chdir(tmp_path / "p")
+    assert names("*.png") == ["a.png"]
 
 
 def test_at_most_max_views_evenly_first_and_last_included(tmp_path, caplog):
@@ -131,6 +146,44 @@ def test_same_names_in_several_folders_are_told_apart(tmp_path):
     assert "listed twice" in refusal([files[0], files[0]])
     with pytest.raises(UserError, match="listed twice"):
         unique_names([Path("/x/a.png"), Path("/x/a.png")])
+    with pytest.raises(UserError, match=r"x/../x/a.png is listed twice"):
+        unique_names([Path("x/a.png"), Path("x/../x/a.png")])
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        (["../x/p.png", "../../x/p.png"], ["one/x/p.png", "x/p.png"]),
+        (["p.png", "../p.png"], ["two/p.png", "one/p.png"]),
+        (["../../p.png", "q.png"], ["p.png", "q.png"]),
+        (["./a.png", "b/../b/a.png"], ["two/a.png", "b/a.png"]),
+    ],
+)
+def test_names_of_photos_stay_below_a_folder(tmp_path, monkeypatch, files, expected):
+    (tmp_path / "one" / "two" / "b").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "one" / "two")
+    for file in files:
+        save(Path(file))
+    found = names(files)
+    assert all(name.endswith(end) for name, end in zip(found, expected, strict=True))
+    assert all(".." not in Path(name).parts and not Path(name).is_absolute() for name in found)
+
+
+@given(st.lists(st.lists(st.sampled_from(["..", "a", "b"]), max_size=4), min_size=1, max_size=4), st.booleans())
+def test_unique_names_are_unique_and_inside(folders, absolute):
+    paths = [Path("/" if absolute else "", *parts, "p.png") for parts in folders]
+    try:
+        found = unique_names(paths)
+    except UserError as error:
+        assert "listed twice" in str(error)
+    else:
+        assert len(set(found)) == len(paths)
+        assert all(".." not in Path(name).parts and not Path(name).is_absolute() for name in found)
+
+
+@pytest.mark.parametrize("name", ["/etc/a.png", "../a.png", "x/../../a.png"])
+def test_photos_of_other_code_may_not_be_named_out_of_a_folder(name):
+    assert f"a photo has the name {name}" in refusal([MemoryPhoto(name, quarters())])
 
 
 # -- images in memory, videos
@@ -341,6 +394,74 @@ def test_list_with_something_else_in_it(tmp_path):
 def test_file_that_is_no_image(tmp_path, suffix):
     (tmp_path / f"a{suffix}").write_bytes(b"no image at all")
     assert f"a{suffix}: the file is not a readable image" in refusal(tmp_path)
+
+
+def test_all_photos_that_cannot_be_used_are_named_at_once(tmp_path, encoded, caplog):
+    for name in ("a.png", "b.png", "e.png"):
+        save(tmp_path / name)
+    (tmp_path / "c.jpg").write_bytes(encoded[".jpg"][:-400])
+    (tmp_path / "d.png").write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
+    (tmp_path / "f.webp").write_bytes(b"")
+    (tmp_path / "g.jpg").symlink_to(tmp_path / "gone.jpg")
+    (tmp_path / "h.png").write_bytes(png_header(20_000, 20_000))
+    message = refusal(tmp_path)
+    assert message.startswith("5 of 8 photos cannot be used: ")
+    assert message.endswith(". Replace them, or leave them out with --skip-bad.")
+    for words in (
+        "c.jpg: the image is damaged or truncated", f"{tmp_path}/d.png, {tmp_path}/f.webp: the file is not a readable",
+        "g.jpg: the file cannot be opened (No such file or directory)", "h.png: its pixels are more than the limit",
+    ):  # fmt: skip
+        assert words in message
+    assert names(tmp_path, skip_bad=True) == ["a.png", "b.png", "e.png"]
+    assert "5 of 8 photos cannot be used and are left out: " in caplog.text
+
+
+def test_one_bad_photo_among_others(tmp_path, encoded, caplog):
+    save(tmp_path / "a.png")
+    bad = tmp_path / "b.jpg"
+    bad.write_bytes(encoded[".jpg"][:-400])
+    assert refusal(tmp_path).startswith(f"{bad}: the image is damaged or truncated (")
+    assert refusal(tmp_path).endswith("). Replace it, or leave it out with --skip-bad.")
+    assert [p.name for p in load_photos([bad, quarters()], skip_bad=True)] == ["image-001"]
+    assert names([tmp_path / "a.png", tmp_path / "gone.png"], skip_bad=True) == ["a.png"]
+    with pytest.raises(UserError, match=r"Replace it or take it out\.$"):
+        load_photos(bad, skip_bad=True)
+
+
+def test_photos_that_are_not_kept_are_not_looked_at(tmp_path):
+    for k in range(5):
+        save(tmp_path / f"{k}.png")
+    (tmp_path / "1.png").write_bytes(b"")
+    assert names(tmp_path, max_views=3) == ["0.png", "2.png", "4.png"]
+
+
+def test_where_the_photos_are_instead(tmp_path):
+    for name in ("left/1.jpg", "left/2.HEIC", "deep/er/3.png"):
+        save(tmp_path / name, format="PNG")
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "x.txt").write_text("")
+    for source in (tmp_path, f"{tmp_path}/*"):
+        assert f"{tmp_path}/left (2)" in refusal(source)
+        assert "`freegeo adapt` takes several" in refusal(source)
+        assert "notes" not in refusal(source)
+    assert f"in 2 folders: {tmp_path}/deep/er (1), {tmp_path}/left (2)" in refusal(tmp_path)
+
+
+def test_videos_in_place_of_photos(tmp_path):
+    for name in ("b.mp4", "a.ts"):
+        (tmp_path / name).write_bytes(b"x")
+    for source in (tmp_path, f"{tmp_path}/*"):
+        assert f"no photos, but 2 videos. Give one video by its name, such as {tmp_path}/a.ts." in refusal(source)
+    photo = save(tmp_path / "p.png")
+    assert "b.mp4: a video among photos, which has to be given alone" in refusal([photo, tmp_path / "b.mp4"])
+    assert "b.mp4: not a readable video" in refusal(f"{tmp_path}/*.mp4")
+    (tmp_path / "c.mp4").write_bytes(b"x")
+    assert "no photos, but 2 videos" in refusal(f"{tmp_path}/*.mp4")
+
+
+def test_a_folder_that_is_named_like_a_video(tmp_path):
+    save(tmp_path / "IMG_0021.MOV" / "a.png")
+    assert names(tmp_path / "IMG_0021.MOV") == names(f"{tmp_path}/IMG_0021.MOV/*") == ["a.png"]
 
 
 def test_empty_file(tmp_path):

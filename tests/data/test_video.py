@@ -5,6 +5,7 @@ from fractions import Fraction
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from freegeo.data import video
 from freegeo.data.video import Candidate, VideoFrame, choose_by_parallax, load_video
@@ -23,16 +24,20 @@ def window(x: int, y: int = 0) -> np.ndarray:
     return picture()[y : y + HEIGHT, x : x + WIDTH]
 
 
-def write_video(path, images, *, times=None, rotation=None, codec="ffv1", gop=12):
+def write_video(
+    path, images, *, times=None, rotation=None, mirrored=False, pixel_aspect=None, codec="ffv1", gop=12, options=None
+):
     """Write images; `times` in milliseconds (default 40 ms apart)."""
-    with av.open(str(path), "w") as container:
+    with av.open(str(path), "w", options=options or {}) as container:
         stream = container.add_stream(codec, rate=25)
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = {"ffv1": "bgr0", "mjpeg": "yuvj420p"}.get(codec, "yuv420p")
         stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
         stream.codec_context.gop_size = gop
         if rotation is not None:
-            stream.set_display_rotation(rotation)
+            stream.set_display_rotation(rotation, hflip=mirrored)
+        if pixel_aspect is not None:
+            stream.codec_context.sample_aspect_ratio = pixel_aspect
         for k, image in enumerate(images):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
             frame.pts, frame.time_base = (times[k] if times else 40 * k), Fraction(1, 1000)
@@ -73,6 +78,43 @@ def test_rotation_metadata_turns_frames_upright(tmp_path, rotation, turns):
     expected = np.rot90(window(40), turns)
     assert frame.size_hw == image.shape[:2] == expected.shape[:2]
     assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.9
+
+
+@pytest.mark.parametrize(("rotation", "turns"), [(0, 0), (90, 1), (180, 2)])
+def test_mirrored_videos_are_shown_as_players_do(tmp_path, rotation, turns):
+    images = [window(40)] * 3
+    path = write_video(tmp_path / "selfie.mp4", images, rotation=rotation, mirrored=True, codec="libx264")
+    frame = load_video(path, max_views=4)[0]
+    expected = np.rot90(window(40), turns)[:, ::-1]
+    assert frame.size_hw == expected.shape[:2]
+    assert np.corrcoef(frame.read().ravel(), expected.ravel())[0, 1] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("aspect", "rotation", "size_hw"),
+    [
+        ((4, 3), None, (HEIGHT, 85)),
+        ((8, 9), None, (54, WIDTH)),
+        ((4, 3), 90, (85, HEIGHT)),
+        ((1, 1), None, (HEIGHT, WIDTH)),
+    ],
+)
+@pytest.mark.parametrize("name", ["hdv.mp4", "hdv.mkv"])
+def test_pixels_are_made_square(tmp_path, aspect, rotation, size_hw, name):
+    path = write_video(
+        tmp_path / name, [window(40)] * 3, rotation=rotation, pixel_aspect=Fraction(*aspect), codec="libx264"
+    )
+    frame = load_video(path, max_views=4)[0]
+    stored = np.rot90(window(40), 1 if rotation else 0)
+    expected = np.asarray(Image.fromarray(np.ascontiguousarray(stored)).resize(size_hw[::-1], Image.Resampling.BICUBIC))
+    assert frame.size_hw == frame.read().shape[:2] == size_hw
+    assert np.corrcoef(frame.read().ravel(), expected.ravel())[0, 1] > 0.9
+
+
+def test_pixels_that_no_camera_has_are_refused(tmp_path):
+    path = write_video(tmp_path / "v.mp4", [window(0)] * 2, pixel_aspect=Fraction(20, 1), codec="libx264")
+    with pytest.raises(UserError, match="20 times as wide as high"):
+        load_video(path, max_views=4)
 
 
 def test_a_resting_camera_gives_one_view_and_motion_gives_many(tmp_path):
@@ -127,6 +169,71 @@ def test_a_truncated_video_gives_what_can_be_decoded(tmp_path):
     frames = load_video(path, fps=25, max_views=100)
     assert 10 <= len(frames) < 30
     assert frames[-1].read().shape == (HEIGHT, WIDTH, 3)
+
+
+@pytest.mark.parametrize("codec", ["libx264", "mjpeg"])
+def test_a_damaged_packet_is_skipped_and_counted(tmp_path, caplog, codec):
+    rng = np.random.default_rng(0)
+    path = write_video(tmp_path / "v.mp4", [rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)] * 40, codec=codec)
+    assert len(load_video(path, fps=25, max_views=99)) == 40
+    assert not caplog.text
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+    spoilt = bytearray(path.read_bytes())
+    for packet in packets[18:20]:
+        spoilt[packet.pos : packet.pos + packet.size] = bytes(packet.size)
+    path.write_bytes(spoilt)
+    frames = load_video(path, fps=25, max_views=99)
+    assert len(frames) == 38
+    assert frames[-1].time_s == pytest.approx(39 * 0.04)
+    assert frames[-1].read().shape == (HEIGHT, WIDTH, 3)
+    assert "2 damaged frames are left out" in caplog.text
+    assert len(caplog.records) == 1, "reading says nothing again"
+
+
+def test_a_video_that_ends_early_is_said(tmp_path, caplog):
+    whole = write_video(tmp_path / "v.mkv", [window(4 * k) for k in range(60)]).read_bytes()
+    load_video(tmp_path / "v.mkv", fps=25, max_views=99)
+    assert not caplog.text
+    (tmp_path / "v.mkv").write_bytes(whole[: len(whole) // 2])
+    assert len(load_video(tmp_path / "v.mkv", fps=25, max_views=99)) < 40
+    assert "should be 2.4 s long, but its frames end at" in caplog.text
+
+
+def test_black_frames_are_no_views(tmp_path, caplog):
+    black = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    path = write_video(tmp_path / "fade.mkv", [black] * 5 + [window(6 * k) for k in range(20)] + [black] * 5)
+    assert all(5 <= frame.number < 25 for frame in load_video(path, max_views=8))
+    assert all(5 <= frame.number < 25 for frame in load_video(path, fps=25, max_views=99))
+    assert not caplog.text
+    assert len(load_video(write_video(tmp_path / "dark.mkv", [black] * 5), max_views=8)) == 1
+    assert "almost black, white or of one colour in every frame" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "ffconcat version 1.0\nfile secret.mkv\n",
+        "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nsecret.mkv\n#EXT-X-ENDLIST\n",
+        "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 9 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
+        "<?xml version='1.0'?><MPD xmlns='urn:mpeg:dash:schema:mpd:2011' profiles='x'></MPD>",
+    ],
+    ids=["ffconcat", "m3u8", "sdp", "dash"],
+)
+def test_playlists_do_not_open_other_files(tmp_path, content):
+    write_video(tmp_path / "secret.mkv", [window(4 * k) for k in range(5)])
+    (tmp_path / "list.mp4").write_text(content)
+    with pytest.raises(UserError, match=r"list\.mp4: not a readable video"):
+        load_video(tmp_path / "list.mp4", max_views=4)
+
+
+def test_names_are_names_and_no_addresses(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_video(tmp_path / "v.mkv", [window(4 * k) for k in range(5)])
+    for name in ("http:v.mkv", "concat:v.mkv|v.mkv", "v%03d.mkv", "v 1?.mkv"):
+        (tmp_path / "v.mkv").rename(name)
+        assert load_video(name, max_views=4)[0].read().shape == (HEIGHT, WIDTH, 3)
+        (tmp_path / name).rename("v.mkv")
 
 
 @pytest.mark.parametrize("content", [b"", b"not a video at all " * 50])
@@ -196,5 +303,8 @@ def test_parallax_never_returns_more_than_asked():
 
 def test_names_of_videos_are_known():
     assert video.is_video("HOLIDAY.MOV")
+    assert video.is_video("clip.ts")
+    assert video.is_video("clip.wmv")
     assert not video.is_video("photo.jpg")
+    assert not video.is_video("photo.gif")
     assert VideoFrame.__dataclass_params__.frozen
