@@ -57,8 +57,7 @@ class FilterOptions:
     min_agreeing: int = DEFAULTS.min_agreeing
     """Other views that must agree with a pixel; more than 0 makes sparse, sure clouds."""
     masks: Path | None = None
-    """Folder with a mask image per photo: white is kept, black left out. IMG_1.jpg has IMG_1.png, IMG_1.jpg.png or
-    IMG_1_mask.png."""
+    """Folder with an image per photo (IMG_1.png or IMG_1_mask.png for IMG_1.jpg); white is kept, black left out."""
 
     def settings(self) -> FilterSettings:
         """Return the filter settings."""
