@@ -96,7 +96,7 @@ def config(folder, text: str) -> str:
 def test_config_sets_options_and_the_command_line_wins(caught, tmp_path):
     file = config(tmp_path, '[run]\nmodel = "da3-large"\nsteps = 5\nmax-views = 7\nrank = 4\n[adapt]\nsteps = 9\n')
     assert main(["run", "x", "-o", "out", "--config", file, "--rank", "8"]) == 0
-    (sources, limit), ((_, _, model, output), options) = caught
+    (sources, limit), ((_, model, output), options) = caught
     assert (sources, limit.max_views) == (("x",), 7)
     assert model.model == "da3-large"
     assert str(output.output) == "out"
@@ -107,7 +107,7 @@ def test_config_sets_options_and_the_command_line_wins(caught, tmp_path):
 def test_config_sets_switches(caught, tmp_path, spelling):
     file = config(tmp_path, '[run]\nadapt = false\noverwrite = true\noutput = "from-file"\n')
     assert main(["run", "x", *spelling.replace("FILE", file).split()]) == 0
-    (_, _, _, output), options = caught[1]
+    (_, _, output), options = caught[1]
     assert options["recipe"] is None
     assert output.overwrite
     assert str(output.output) == "from-file"
@@ -117,7 +117,7 @@ def test_config_sets_switches(caught, tmp_path, spelling):
 def test_the_home_folder_may_be_short_in_every_option(caught, tmp_path, monkeypatch, given):
     monkeypatch.setenv("HOME", str(tmp_path))
     assert main(["run", "~/photos", *given, "--checkpoint=~/w.pt", "--masks", "~/m"]) == 0
-    (sources, _), ((_, _, model, output), options) = caught
+    (sources, _), ((_, model, output), options) = caught
     assert sources == (f"{tmp_path}/photos",)
     assert output.output == tmp_path / "x"
     assert model.checkpoint == tmp_path / "w.pt"
@@ -127,7 +127,7 @@ def test_the_home_folder_may_be_short_in_every_option(caught, tmp_path, monkeypa
 def test_the_home_folder_may_be_short_in_a_config(caught, tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     assert main(["run", "x", "--config", config(tmp_path, '[run]\noutput = "~/x"\nsteps = 3\n')]) == 0
-    (_, _, _, output), options = caught[1]
+    (_, _, output), options = caught[1]
     assert output.output == tmp_path / "x"
     assert options["recipe"].steps == 3
 
