@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from freegeo.cli import console
-from freegeo.cli.files import FORMAT_NAMES, FilterOptions
+from freegeo.cli.files import FORMAT_NAMES, FilterOptions, require_complete
+from freegeo.errors import UserError
 from freegeo.export.base import MAX_TRACKS
 from freegeo.fusion.settings import MAX_POINTS
+
+if TYPE_CHECKING:
+    from freegeo.data.photos import Photo
+    from freegeo.export.reconstruction import Reconstruction
 
 DEFAULT_FILTERS = FilterOptions()
 
@@ -31,11 +36,11 @@ def export(
     Parameters
     ----------
     source
-        Folder that `run` or `reconstruct` wrote.
+        Folder that `run` or `reconstruct` wrote, or a prediction.npz.
     output
-        Folder for the files; default: the reconstruction's own.
+        Folder for the files; default: that of the prediction.
     frozen
-        Export the prediction before adaptation.
+        Export the prediction before adaptation (default output: frozen/ in the folder).
     max_points
         Most points in point clouds.
     max_tracks
@@ -43,19 +48,58 @@ def export(
     voxel
         Voxel edge of the mesh, in the reconstruction's units; default: from its resolution.
     """
-    from freegeo.export import formats
-    from freegeo.export.pixels import masks_for_model
+    from freegeo.export.formats import check_formats
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.pipeline import FROZEN_FOLDER
+    from freegeo.run_folder import locked
 
-    reconstruction = Reconstruction.load(source / FROZEN_FOLDER if frozen else source)
+    source = source.expanduser()
+    stored = source / FROZEN_FOLDER if frozen else source
+    reconstruction = Reconstruction.load(stored)
+    home = stored.parent if stored.is_file() else stored
+    target = home if output is None else output.expanduser()
+    run = result_folder(home)
+    if result_folder(target) not in (None, run):
+        raise UserError(f"{target}: holds another result. Choose another folder for the files (--output).")
+    names = check_formats(format, reconstruction.names, has_cameras=reconstruction.has_cameras)
     masks = filters.load_masks(reconstruction.names)
-    wanted = None if masks is None else masks_for_model(reconstruction, masks)
-    filtered = formats.filter_reconstruction(reconstruction, masks=wanted, settings=filters.settings())
-    files = formats.export(
-        reconstruction, output or source, format, filtered=filtered, max_points=max_points, max_tracks=max_tracks,
-        voxel=voxel,
-    )  # fmt: skip
-    console.say(filtered[1].summary())
-    for file in files:
+    with locked(result_folder(target) or target):
+        result = reconstruction.export(
+            target, names, filters=filters.settings(), masks=masks, photos=find_photos(reconstruction, run or home),
+            max_points=max_points, max_tracks=max_tracks, voxel=voxel,
+        )  # fmt: skip
+    for file in result.files:
         console.say(f"  {file}  {console.size(file)}")
+    require_complete(target, result.failed)
+
+
+def result_folder(folder: Path) -> Path | None:
+    """Return the output folder of a run that a folder is, or is in; None where it is in none."""
+    from freegeo.files import RUN_FILE
+
+    folder = folder.resolve()
+    return next((parent for parent in (folder, *folder.parents) if (parent / RUN_FILE).is_file()), None)
+
+
+def find_photos(reconstruction: Reconstruction, run: Path) -> list[Photo] | None:
+    """Return the photos of a stored result if all are as they were, or as upright copies in its folder; else None."""
+    from freegeo.data.photos import Photo
+    from freegeo.export.photos import FOLDER, content_hash, copy_names
+    from freegeo.files import ledger, read_json
+    from freegeo.pipeline import SUMMARY_NAME
+
+    summary = read_json(run / SUMMARY_NAME) if (run / SUMMARY_NAME).is_file() else {}
+    records = dict(zip(summary.get("images", ()), summary.get("photo_files", ()), strict=False))
+    own = set(ledger(run))
+    photos = []
+    for name, copy, (height, width) in zip(
+        reconstruction.names, copy_names(reconstruction.names), reconstruction.photo_hw.tolist(), strict=True
+    ):
+        record = records.get(name)
+        file = Path(record["file"]) if record else run
+        if not record or not file.is_file() or content_hash(file) != record["sha256"]:
+            file = run / FOLDER / copy
+            if f"{FOLDER}/{copy}" not in own or not file.is_file():
+                return None
+        photos.append(Photo(name, file, (height, width)))
+    return photos
