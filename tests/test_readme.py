@@ -69,7 +69,8 @@ def test_programs_of_the_python_page_run(photo_folder, capsys):
     assert not np.array_equal(names["adapted"].depth_z, names["between"].depth_z)
     assert len(names["result"].curve) == 20
     assert np.array_equal(names["opened"].depth_z, names["adapted"].depth_z)
-    assert all(path.is_file() for path in names["files"])
+    assert all(path.is_file() for path in names["exported"].files)
+    assert names["exported"].failed == {}
 
 
 @pytest.mark.parametrize("link", sorted(set(re.findall(r"\]\(([^)#:]+)\)", (ROOT / "README.md").read_text()))))

@@ -80,22 +80,14 @@ def _door(path: Path, folder: Path) -> Generator[Path]:
         # A process that is killed cannot remove its part; `remove_parts` finds it by this entry.
         _enter_in_ledger([part])
         yield part
+    except PermissionError:
+        raise UserError(f"{path.parent}: the folder cannot be written to. Choose another output folder.") from None
     except OSError as error:
-        if error.errno is None or not _concerns(error, part):
+        if error.errno is None:
             raise
-        if isinstance(error, PermissionError):
-            raise UserError(f"{path.parent}: the folder cannot be written to. Choose another output folder.") from None
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         _remove(part)
-
-
-def _concerns(error: OSError, part: Path) -> bool:
-    """Whether an error is about what is written, not about a file that is read meanwhile, such as a photo."""
-    if error.filename is None:
-        return True
-    file = Path(os.fsdecode(error.filename))
-    return file in (part, *part.parents) or part in file.parents or file.name == LEDGER_FILE
 
 
 def _remove(path: Path) -> None:
