@@ -164,8 +164,9 @@ def remove_written(place: Path, *, keep: Iterable[Path] = ()) -> None:
         below = _entry(place, owner)
         names = ledger(owner)
         gone = [name for name in names if (name == below or name.startswith(f"{below}/")) and name not in kept]
-        remove_listed(owner, gone)
-        write_ledger(owner, [name for name in names if name not in gone])
+        if gone:
+            remove_listed(owner, gone)
+            write_ledger(owner, [name for name in names if name not in gone])
 
 
 def remove_listed(owner: Path, names: Iterable[str]) -> None:

@@ -16,6 +16,7 @@ from freegeo.files import LEDGER_FILE, RUN_FILE
 from freegeo.fusion.settings import FilterSettings
 from freegeo.models.da3 import DA3
 
+RESULT = {"report.html", "reconstruction.json", "prediction.npz", "kept.npz"}
 COPIES = {f"images/{k}.png" for k in range(PHOTOS)}
 
 
@@ -147,7 +148,7 @@ def test_a_format_that_fails_costs_neither_the_report_nor_the_others(
         assert outcome.sentence().endswith("ply not written, everything else is there. The warnings say why.")
     assert "warning: Format ply is not written: no point is left to write" in first.err
     assert "already finished" in again.out
-    expected = {"report.html", "reconstruction.json", "prediction.npz", "depth/depth.json"}
+    expected = {*RESULT, "depth/depth.json"}
     assert files(tmp_path / "out") == expected | {f"depth/{k}.png" for k in range(PHOTOS)}
     summary = json.loads((tmp_path / "out" / "reconstruction.json").read_text())
     assert list(summary["not_written"]) == ["ply"]
@@ -194,7 +195,7 @@ def test_overwrite_leaves_nothing_of_the_result_before(freegeo, photo_folder, ti
     assert freegeo("reconstruct", photo_folder, "-o", out, *tiny, *formats).code == 0
     (out / "colmap" / "mine.txt").write_text("mine")
     assert freegeo("reconstruct", fewer, "-o", out, *tiny, "--formats", "ply", "--overwrite").code == 0
-    assert files(out) == {"report.html", "reconstruction.json", "prediction.npz", "points.ply", "colmap/mine.txt"}
+    assert files(out) == {*RESULT, "points.ply", "colmap/mine.txt"}
     assert freegeo("export", out, "-f", "colmap").code == 0
     model = pycolmap.Reconstruction(out / "colmap" / "sparse" / "0")
     assert {image.name for image in model.images.values()} == {"new0.png", "new1.png"}

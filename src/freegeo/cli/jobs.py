@@ -113,8 +113,8 @@ def run_job(
         job = Job(
             load=model_options.load, spec=empty.spec, batch=batch, folder=folder, recipe=plan, adapter=adapter,
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
-            command=console.command_line(), warnings=console.warned(), after=after, formats=formats,
-            photos=photos, filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity(),
+            command=console.command_line(), warnings=console.warned(), after=after, formats=formats, photos=photos,
+            filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity(),
             scene=None if plan is None else lambda model: scene_images("photos", photos, model, plan, batch),
         )  # fmt: skip
         summary = job.run()
