@@ -237,9 +237,11 @@ def test_photos_that_are_no_longer_as_they_were_are_not_copied(freegeo, out, fat
     assert len(json.loads((out / "transforms.json").read_text())["frames"]) == PHOTOS
 
 
-def test_copies_of_the_run_stand_for_photos_that_are_gone(freegeo, photo_folder, tiny, tmp_path):
+@pytest.mark.parametrize("format", ["nerfstudio", "colmap"])
+def test_copies_of_the_run_stand_for_photos_that_are_gone(freegeo, photo_folder, tiny, tmp_path, format):
+    pytest.importorskip("pycolmap", reason="needs the extra colmap")
     photos, out = shutil.copytree(photo_folder, tmp_path / "photos"), tmp_path / "out"
-    assert freegeo("reconstruct", photos, "-o", out, *tiny, "--formats", "nerfstudio").code == 0
+    assert freegeo("reconstruct", photos, "-o", out, *tiny, "--formats", format).code == 0
     shutil.rmtree(photos)
     outcome = freegeo("export", out, "-f", "nerfstudio")
     assert "not at hand" not in outcome.err

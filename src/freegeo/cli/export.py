@@ -84,6 +84,7 @@ def result_folder(folder: Path) -> Path | None:
 def find_photos(reconstruction: Reconstruction, run: Path) -> list[Photo] | None:
     """Return the photos of a stored result if all are as they were, or as upright copies in its folder; else None."""
     from freegeo.data.photos import Photo
+    from freegeo.export import colmap
     from freegeo.export.photos import FOLDER, content_hash, copy_names
     from freegeo.files import ledger, read_json
     from freegeo.pipeline import SUMMARY_NAME
@@ -98,8 +99,10 @@ def find_photos(reconstruction: Reconstruction, run: Path) -> list[Photo] | None
         record = records.get(name)
         file = Path(record["file"]) if record else run
         if not record or not file.is_file() or content_hash(file) != record["sha256"]:
-            file = run / FOLDER / copy
-            if f"{FOLDER}/{copy}" not in own or not file.is_file():
+            places = [f"{folder}{FOLDER}/{copy}" for folder in ("", f"{colmap.FORMAT.path}/")]
+            copied = [run / place for place in places if place in own and (run / place).is_file()]
+            if not copied:
                 return None
+            file = copied[0]
         photos.append(Photo(name, file, (height, width)))
     return photos
