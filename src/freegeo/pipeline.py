@@ -417,9 +417,9 @@ class Job:
             filtered = None
             if final.has_cameras:
                 if frozen is not None:
-                    save_kept(self.folder / FROZEN_FOLDER, self._filtered(frozen, masks))
+                    save_kept(self.folder / FROZEN_FOLDER, self._filtered(frozen, masks), masks)
                 filtered = self._filtered(final, masks)
-                save_kept(self.folder.path, filtered)
+                save_kept(self.folder.path, filtered, masks)
             exported = export(
                 final, self.folder.path, self.formats, filtered=filtered, masks=masks, photos=self.photos,
                 seed=self.seed,

@@ -64,6 +64,24 @@ def test_the_filters_are_told_once(freegeo, out):
     assert (outcome.out + outcome.err).count("% of 12288 pixels") == 1
 
 
+def test_without_options_the_points_are_those_that_the_run_kept(freegeo, photo_folder, tiny, tmp_path):
+    out, masks = tmp_path / "out", tmp_path / "masks"
+    masks.mkdir()
+    mask = np.zeros((48, 64), np.uint8)
+    mask[10:20, 10:30] = 255
+    for k in range(PHOTOS):
+        Image.fromarray(mask).save(masks / f"{k}.png")
+    command = ["reconstruct", photo_folder, "-o", out, *tiny, "--formats", "ply", "--masks", masks, "--drop-share", 0]
+    assert freegeo(*command).code == 0
+    assert freegeo("export", out, "-f", "ply,depth", "-o", tmp_path / "new").code == 0
+    assert (tmp_path / "new" / "points.ply").read_bytes() == (out / "points.ply").read_bytes()
+    with Image.open(tmp_path / "new" / "depth" / "0.png") as image:
+        np.testing.assert_array_equal(np.array(image) > 0, mask > 0)
+    for options in (["--drop-share", 0.4], ["--drop-share", 0], ["--no-flying"], ["--masks", masks]):
+        assert freegeo("export", out, "-f", "ply", "-o", tmp_path / "other", *options).code == 0
+        assert points(tmp_path / "other") != points(out), "options are used even if they are the defaults"
+
+
 def test_the_frozen_prediction_does_not_replace_the_files_of_the_adapted_one(freegeo, out):
     (out / "frozen").mkdir()
     shutil.copy(out / "prediction.npz", out / "frozen")
@@ -159,12 +177,12 @@ def test_a_format_that_fails_costs_neither_the_report_nor_the_others(
 def test_export_is_partial_too_and_fails_when_nothing_is_written(freegeo, out, monkeypatch):
     strict = FilterSettings(min_agreeing=50, min_asked=0)
     monkeypatch.setattr("freegeo.cli.files.FilterOptions.settings", lambda self: strict)
-    outcome = freegeo("export", out, "-f", "ply", "depth")
+    outcome = freegeo("export", out, "-f", "ply", "depth", "--min-agreeing", 50)
     assert outcome.code == 3
     assert "ply not written" in outcome.sentence()
     assert str(out / "depth" / "0.png") in outcome.out
     assert not (out / "points.ply").exists(), "the points of other filters are gone"
-    outcome = freegeo("export", out, "-f", "ply")
+    outcome = freegeo("export", out, "-f", "ply", "--min-agreeing", 50)
     assert outcome.code == 1
     assert "nothing was written" in outcome.sentence()
 

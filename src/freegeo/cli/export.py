@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from freegeo.data.photos import Photo
     from freegeo.export.reconstruction import Reconstruction
 
-DEFAULT_FILTERS = FilterOptions()
-
 
 def export(
     source: Path,
@@ -29,14 +27,15 @@ def export(
     max_points: int = MAX_POINTS,
     max_tracks: int = MAX_TRACKS,
     voxel: float | None = None,
-    filters: FilterOptions = DEFAULT_FILTERS,
+    filters: FilterOptions | None = None,
 ) -> None:
     """Write a reconstruction in other formats.
 
     Parameters
     ----------
     source
-        Folder that `run` or `reconstruct` wrote, or a prediction.npz.
+        Folder that `run` or `reconstruct` wrote, or a prediction.npz. The points are those that the run kept, unless
+        an option of the filters below is given; then all filters run again.
     output
         Folder for the files; default: that of the prediction.
     frozen
@@ -48,7 +47,9 @@ def export(
     voxel
         Voxel edge of the mesh, in the reconstruction's units; default: from its resolution.
     """
-    from freegeo.export.formats import check_formats
+    from freegeo.export import formats
+    from freegeo.export.kept import load_kept, load_masks
+    from freegeo.export.pixels import masks_for_model
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.pipeline import FROZEN_FOLDER
     from freegeo.run_folder import locked
@@ -61,13 +62,21 @@ def export(
     run = result_folder(home)
     if result_folder(target) not in (None, run):
         raise UserError(f"{target}: holds another result. Choose another folder for the files (--output).")
-    names = check_formats(format, reconstruction.names, has_cameras=reconstruction.has_cameras)
-    masks = filters.load_masks(reconstruction.names)
+    names = formats.check_formats(format, reconstruction.names, has_cameras=reconstruction.has_cameras)
+    filtered, masks = None, None
+    if filters is None:
+        filtered = load_kept(home, reconstruction.depth_z.shape)
+        masks = None if filtered is None else load_masks(home)
+    else:
+        given = filters.load_masks(reconstruction.names)
+        masks = None if given is None else masks_for_model(reconstruction, given)
+        if reconstruction.has_cameras:
+            filtered = formats.filter_reconstruction(reconstruction, masks=masks, settings=filters.settings())
     with locked(result_folder(target) or target):
-        result = reconstruction.export(
-            target, names, filters=filters.settings(), masks=masks, photos=find_photos(reconstruction, run or home),
-            max_points=max_points, max_tracks=max_tracks, voxel=voxel,
-        )  # fmt: skip
+        result = formats.export(
+            reconstruction, target, names, filtered=filtered, masks=masks,
+            photos=find_photos(reconstruction, run or home), max_points=max_points, max_tracks=max_tracks, voxel=voxel,
+        ).require_any()  # fmt: skip
     for file in result.files:
         console.say(f"  {file}  {console.size(file)}")
     require_complete(target, result.failed)

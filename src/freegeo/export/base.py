@@ -56,6 +56,12 @@ class Exported:
     failed: Mapping[str, str]
     """Name of a format -> why it was not written, in a sentence."""
 
+    def require_any(self) -> Exported:
+        """Return this; FreeGeoError when no file was written."""
+        if not self.files:
+            raise FreeGeoError(f"nothing was written: {next(iter(self.failed.values()))}")
+        return self
+
 
 @dataclass(frozen=True, kw_only=True)
 class Export:

@@ -211,13 +211,10 @@ class Reconstruction:
         names = check_formats(formats, self.names, has_cameras=self.has_cameras)
         wanted = None if masks is None else masks_for_model(self, masks)
         filtered = filter_reconstruction(self, masks=wanted, settings=filters) if self.has_cameras else None
-        result = export(
+        return export(
             self, Path(folder).expanduser(), names, filtered=filtered, masks=wanted, photos=photos,
             max_points=max_points, max_tracks=max_tracks, voxel=voxel, seed=seed,
-        )  # fmt: skip
-        if not result.files:
-            raise FreeGeoError(f"{folder}: nothing was written: {next(iter(result.failed.values()))}")
-        return result
+        ).require_any()  # fmt: skip
 
     @classmethod
     def load(cls, path: Path | str) -> Reconstruction:
