@@ -254,8 +254,9 @@ def test_depth_maps_follow_the_masks_but_not_the_filters_and_say_so(tmp_path):
     scene = room()
     masks = [np.zeros(tuple(hw), np.uint8) for hw in scene.photo_hw]
     masks[1][20:40, 20:40] = 1
-    for name, cameras in (("posed", scene), ("flat", replace(scene, T_cam_world=None, K=None))):
-        cameras.export(tmp_path / name, ["depth"], masks=masks, filters=NOTHING)
+    flat = replace(scene, T_cam_world=None, K=None)
+    for name, cameras, formats in (("posed", scene, ["depth", "glb"]), ("flat", flat, ["depth"])):
+        cameras.export(tmp_path / name, formats, masks=masks, filters=NOTHING)
         content = json.loads((tmp_path / name / "depth" / "depth.json").read_text())
         assert "outside the masks" in content["meaning"] and "not applied" in content["meaning"]
         with Image.open(tmp_path / name / "depth" / content["maps"][scene.names[1]]) as image:
