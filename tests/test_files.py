@@ -9,7 +9,7 @@ import torch
 
 from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import atomic_path
+from freegeo.files import LEDGER_FILE, atomic_folder, atomic_path, inside, keep_ledger, ledger, remove_written
 
 
 def names_in(folder: Path) -> set[str]:
@@ -82,3 +82,158 @@ def test_a_full_disk_names_the_file_that_was_asked_for(tmp_path):
         raise OSError(28, "No space left on device")
     assert caught.value.filename == str(path)
     assert list(tmp_path.iterdir()) == []
+
+
+# -- folders
+
+
+def written_folder(folder: Path, *names: str) -> None:
+    with atomic_folder(folder) as part:
+        for name in names:
+            (part / name).parent.mkdir(parents=True, exist_ok=True)
+            (part / name).write_text(name)
+
+
+def test_folder_appears_only_when_it_is_complete(tmp_path):
+    with atomic_folder(tmp_path / "deep" / "model") as part:
+        (part / "a.bin").write_text("a")
+        assert not (tmp_path / "deep" / "model").exists()
+    assert names_in(tmp_path) == {"deep/model/a.bin"}
+
+
+@pytest.mark.parametrize("noted", [True, False])
+def test_folder_replaces_what_was_written_before_and_spares_other_files(tmp_path, noted):
+    if noted:
+        keep_ledger(tmp_path)
+    written_folder(tmp_path / "model", "a.bin", "old.bin", "deep/old.bin")
+    (tmp_path / "model" / "mine.txt").write_text("mine")
+    written_folder(tmp_path / "model", "a.bin", "new.bin")
+    # Without a ledger nobody knows whose the other files are.
+    left = set() if noted else {"model/old.bin", "model/deep/old.bin"}
+    assert names_in(tmp_path) - {LEDGER_FILE} == {"model/a.bin", "model/new.bin", "model/mine.txt"} | left
+    assert (tmp_path / "model" / "deep").exists() != noted
+
+
+def test_failure_while_a_folder_is_written_keeps_the_old_one(tmp_path):
+    keep_ledger(tmp_path)
+    written_folder(tmp_path / "model", "a.bin")
+    with pytest.raises(RuntimeError), atomic_folder(tmp_path / "model") as part:
+        (part / "a.bin").write_text("half")
+        raise RuntimeError
+    assert (tmp_path / "model" / "a.bin").read_text() == "a.bin"
+    assert names_in(tmp_path) == {LEDGER_FILE, "model/a.bin"}
+
+
+def test_a_stop_between_old_and_new_never_leaves_a_mixture(tmp_path, monkeypatch):
+    keep_ledger(tmp_path)
+    written_folder(tmp_path / "model", "a.bin", "b.bin")
+    plain, moved = Path.replace, []
+
+    def replace_one(path, target):
+        moved.extend([target] if target.suffix == ".bin" else [])
+        if len(moved) == 2:
+            raise KeyboardInterrupt
+        return plain(path, target)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt), atomic_folder(tmp_path / "model") as part:
+        for name in ("a.bin", "b.bin"):
+            (part / name).write_text("new")
+        patch.setattr(Path, "replace", replace_one)
+    assert names_in(tmp_path) == {LEDGER_FILE, "model/a.bin"}
+    assert (tmp_path / "model" / "a.bin").read_text() == "new"
+
+
+# -- the ledger, and places outside the folder
+
+
+def test_what_was_written_is_removed_and_no_other_file(tmp_path):
+    keep_ledger(tmp_path)
+    for name in ("a.json", "maps/a.json", "maps/b.json", "maps2/a.json"):
+        files.write_json(tmp_path / name, 1)
+    (tmp_path / "maps" / "mine.txt").write_text("")
+    remove_written(tmp_path / "maps", keep=[tmp_path / "maps" / "b.json"])
+    assert names_in(tmp_path) == {LEDGER_FILE, "a.json", "maps/b.json", "maps2/a.json", "maps/mine.txt"}
+    remove_written(tmp_path / "maps2")
+    assert not (tmp_path / "maps2").exists()
+    (tmp_path / "a.json").unlink()
+    remove_written(tmp_path / "a.json")
+    (tmp_path / "a.json").write_text("mine now")
+    remove_written(tmp_path / "a.json")
+    assert (tmp_path / "a.json").read_text() == "mine now"
+
+
+def test_names_with_odd_characters_come_back_from_the_ledger(tmp_path):
+    keep_ledger(tmp_path)
+    names = ["zoë 客厅.json", "a\u2028b.json", "a\x85b.json", os.fsdecode(b"caf\xe9.json")]
+    for name in names:
+        files.write_json(tmp_path / name, 1)
+    assert set(names) <= set(ledger(tmp_path))
+    for name in names:
+        remove_written(tmp_path / name)
+    assert names_in(tmp_path) == {LEDGER_FILE}
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../a", "a/../../b", "/etc/a", "a\nb", "a\x00b", "a\rb"])
+def test_names_that_lead_out_are_refused(tmp_path, name):
+    with pytest.raises(UserError, match="cannot be the name of a file below"):
+        inside(tmp_path, name)
+
+
+def test_names_that_only_look_odd_are_not(tmp_path):
+    for name in ("a/b.png", "..a", "a..b/c", "~", "-x"):
+        assert inside(tmp_path, name).is_relative_to(tmp_path)
+
+
+@pytest.mark.parametrize("way", ["link", "link above", "dots"])
+def test_nothing_is_written_through_a_way_out_of_the_folder(tmp_path, way):
+    out, outside = tmp_path / "out", tmp_path / "outside"
+    outside.mkdir()
+    keep_ledger(out)
+    place = out / "maps"
+    if way == "link":
+        place.symlink_to(outside)
+    elif way == "link above":
+        (out / "deep").symlink_to(tmp_path)
+        place = out / "deep" / "outside"
+    else:
+        place = out / "maps" / ".." / ".." / "outside"
+    for write in (lambda: files.write_json(place / "a.json", 1), lambda: written_folder(place, "a.json")):
+        if way == "dots":
+            (out / "maps").mkdir(exist_ok=True)
+        with pytest.raises(UserError, match="leads out of the output folder"):
+            write()
+    assert list(outside.iterdir()) == []
+
+
+def test_a_folder_that_became_a_link_is_not_followed_when_files_are_removed(tmp_path):
+    out, outside = tmp_path / "out", tmp_path / "outside"
+    keep_ledger(out)
+    files.write_json(out / "maps" / "a.json", 1)
+    (out / "maps").rename(outside)
+    (out / "maps").symlink_to(outside)
+    remove_written(out / "maps")
+    assert names_in(outside) == {"a.json"}
+
+
+def test_links_and_ways_inside_the_folder_are_allowed(tmp_path):
+    out = tmp_path / "out"
+    keep_ledger(out)
+    (out / "real").mkdir()
+    (out / "maps").symlink_to(out / "real")
+    files.write_json(out / "maps" / "a.json", 1)
+    files.write_json(out / "maps" / ".." / "b.json", 1)
+    assert {"real/a.json", "b.json"} <= set(ledger(out))
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.symlink_to(out)
+    files.write_json(elsewhere / "c.json", 1)
+    remove_written(out / "real")
+    assert names_in(out) == {LEDGER_FILE, "b.json", "c.json"}
+
+
+@pytest.mark.parametrize("length", [250, 255])
+def test_names_as_long_as_a_file_may_have_can_be_written(tmp_path, length):
+    for letter, suffix in (("x", ".json"), ("客", ".json"), ("x", "." + "y" * 100)):
+        room = length - len(suffix)
+        name = letter * (room // len(letter.encode())) + suffix
+        files.write_json(tmp_path / name, 1)
+        assert files.read_json(tmp_path / name) == 1

@@ -11,7 +11,7 @@ import pytest
 
 from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import LEDGER_FILE, LOCK_FILE, RUN_FILE, write_json
+from freegeo.files import LEDGER_FILE, LOCK_FILE, RUN_FILE, atomic_path, write_json
 from freegeo.run_folder import Part, check_folder, difference, locked, run_folder
 
 SETTINGS = {"model": "tiny", "recipe": {"steps": 2, "keep": (0, 2)}, "seed": 1}
@@ -364,3 +364,35 @@ with run_folder(Path({str(tmp_path)!r}), {{"a": 1}}) as run:
     with run_folder(tmp_path, {"a": 1}) as run:
         assert not run.finished
         assert visible(tmp_path) == {"deep/a.json"}
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_killed_process_leaves_the_old_folder_and_its_half_folder_is_cleared_away(tmp_path, overwrite):
+    code = f"""
+from freegeo.files import atomic_folder, atomic_path
+from freegeo.run_folder import run_folder
+with run_folder(Path({str(tmp_path)!r}), {{"a": 1}}) as run:
+    with atomic_folder(run / "colmap" / "0") as part:
+        (part / "a.bin").write_text("old")
+    with atomic_folder(run / "colmap" / "0") as part, atomic_path(run / "first" / "b.txt") as file:
+        (part / "a.bin").write_text("half")
+        file.write_text("half")
+        print("READY", flush=True)
+        time.sleep(60)
+"""
+    process = child(code)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert len(visible(tmp_path)) == 3
+    (tmp_path / "colmap" / "mine.part").write_text("mine")
+    with run_folder(tmp_path, {"a": 1}, overwrite=overwrite):
+        assert visible(tmp_path) == {"colmap/mine.part"} | (set() if overwrite else {"colmap/0/a.bin"})
+        assert overwrite or (tmp_path / "colmap" / "0" / "a.bin").read_text() == "old"
+        assert not (tmp_path / "first").exists()
+
+
+def test_a_block_that_is_refused_while_it_writes_leaves_no_trace(tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(UserError, match="no"), run_folder(out, SETTINGS), atomic_path(out / "a.txt"):
+        raise UserError("no")
+    assert not (tmp_path / "out").exists()

@@ -7,3 +7,7 @@ class FreeGeoError(Exception):
 
 class UserError(FreeGeoError, ValueError):
     """The request cannot be carried out as asked; the sentence says what to change (exit code 2)."""
+
+
+class PartialResultError(FreeGeoError):
+    """Everything was written but for what the sentence names (exit code 3)."""

@@ -1,4 +1,4 @@
-"""Atomic writes of files, and the ledger of what was written below a run's folder.
+"""The one way into an output folder: atomic writes of files and folders, and the ledger of what was written there.
 
 A ledger in an output folder lists what freegeo wrote there, so that replacing a result never touches a file that
 somebody put beside it. Only the standard library is used here.
@@ -6,10 +6,13 @@ somebody put beside it. Only the standard library is used here.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import re
 import secrets
-from collections.abc import Generator, Mapping
+import shutil
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,9 @@ RUN_FILE = ".freegeo-run.json"
 LOCK_FILE = ".freegeo-lock"
 LEDGER_FILE = ".freegeo-files"
 OWN_FILES = frozenset({RUN_FILE, LOCK_FILE, LEDGER_FILE})
+NAME_MAX = 255
+"""Longest name of a file in bytes, on every common file system."""
+_PART = re.compile(r"\..+\.[0-9a-f]{8}\.part(\..*)?")
 
 
 @contextmanager
@@ -29,15 +35,51 @@ def atomic_path(path: Path) -> Generator[Path]:
     """Give a temporary path beside `path` to write to; it takes the final name only when the block succeeds.
 
     The temporary name keeps the suffix, since writers choose the format by it. UserError when the folder cannot be
-    written to; an OSError while writing, such as a full disk, names the final path.
+    written to, or when `path` leads out of the output folder; an OSError while writing, such as a full disk, names the
+    final path.
     """
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
+    with _door(path, path.parent) as part:
+        yield part
+        _flush(part)
+        _enter_in_ledger([path])
+        part.replace(path)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Generator[Path]:
+    """Give a temporary folder beside `path` to write files into; when the block succeeds they replace those of before.
+
+    What freegeo wrote below `path` earlier is removed first, and so is whatever has the name of a new file; other files
+    stay. Old and new files are never there together: a stop in between leaves some missing. Errors as `atomic_path`.
+    """
+    with _door(path, path) as part:
+        part.mkdir()
+        yield part
+        new = sorted(file.relative_to(part) for file in part.rglob("*") if file.is_file())
+        for name in new:
+            _flush(part / name)
+        remove_written(path)
+        for name in new:
+            (path / name).unlink(missing_ok=True)
+        _enter_in_ledger([path / name for name in new])
+        for name in new:
+            (path / name).parent.mkdir(parents=True, exist_ok=True)
+            (part / name).replace(path / name)
+
+
+@contextmanager
+def _door(path: Path, folder: Path) -> Generator[Path]:
+    """Give the temporary path for what will be `path`, and remove it afterwards; `folder` is where files are put."""
+    owner = _owner(path)
+    if owner is not None and path.name not in OWN_FILES and not _is_below(folder, owner):
+        raise UserError(f"{path}: leads out of the output folder {owner}. Remove the symbolic link, or the '..'.")
+    # Short, so that it fits wherever the final name does.
+    part = path.with_name(f".{path.stem[:40]}.{secrets.token_hex(4)}.part{path.suffix[:20]}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        _flush(temporary)
-        _enter_in_ledger(path)
-        temporary.replace(path)
+        # A process that is killed cannot remove its part; `remove_parts` finds it by this entry.
+        _enter_in_ledger([part])
+        yield part
     except PermissionError:
         raise UserError(f"{path.parent}: the folder cannot be written to. Choose another output folder.") from None
     except OSError as error:
@@ -45,7 +87,14 @@ def atomic_path(path: Path) -> Generator[Path]:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        _remove(part)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _flush(path: Path) -> None:
@@ -57,13 +106,113 @@ def _flush(path: Path) -> None:
     path.chmod(0o666 & ~mask)
 
 
-def _enter_in_ledger(path: Path) -> None:
-    """Add a file to the ledger of the run folder that it is in, if it is in one."""
-    path = path.absolute()
-    owner = next((folder for folder in path.parents if (folder / RUN_FILE).is_file()), None)
-    if owner is not None and path.name not in OWN_FILES:
-        with (owner / LEDGER_FILE).open("a", encoding="utf-8") as file:
-            file.write(path.relative_to(owner).as_posix() + "\n")
+def inside(folder: Path, name: str) -> Path:
+    """Return the path of a file below a folder; UserError for a name that leads out of it, or that no file can have.
+
+    Every name that comes from outside, such as a photo's, goes through here before it becomes a path.
+    """
+    path = Path(name)
+    if not path.name or path.is_absolute() or path.drive or ".." in path.parts or re.search(r"[\x00\r\n]", name):
+        raise UserError(f"{name!r} cannot be the name of a file below {folder}. Rename the photo.")
+    return folder / path
+
+
+def fitted(name: str) -> str:
+    """Return a file name that fits into `NAME_MAX` bytes: the name, or its beginning and a fingerprint of the whole."""
+    path = Path(name)
+    stem = path.stem
+    if len(os.fsencode(path.name)) <= NAME_MAX:
+        return name
+    ending = f"-{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}{path.suffix}"
+    while len(os.fsencode(stem + ending)) > NAME_MAX:
+        stem = stem[:-1]
+    return path.with_name(stem + ending).as_posix()
+
+
+def keep_ledger(folder: Path) -> None:
+    """Make a folder that notes down what is written below it; a part of an output folder does so already."""
+    if _owner(folder / LEDGER_FILE) is None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / LEDGER_FILE).touch()
+        except OSError as error:
+            raise UserError(f"{folder}: the folder cannot be written to ({error.strerror}). Choose another.") from None
+
+
+def ledger(folder: Path) -> list[str]:
+    """Names of the files that freegeo wrote below an output folder, each once; the files need not exist any more."""
+    file = folder / LEDGER_FILE
+    text = file.read_text(encoding="utf-8", errors="surrogateescape") if file.is_file() else ""
+    names = dict.fromkeys(line for line in text.split("\n") if line)
+    return [name for name in names if ".." not in Path(name).parts and not Path(name).is_absolute()]
+
+
+def write_ledger(folder: Path, names: Iterable[str]) -> None:
+    """Replace the list of the files that freegeo wrote below an output folder."""
+    with atomic_path(folder / LEDGER_FILE) as part:
+        part.write_text("".join(f"{name}\n" for name in names), encoding="utf-8", errors="surrogateescape")
+
+
+def remove_written(place: Path, *, keep: Iterable[Path] = ()) -> None:
+    """Remove what freegeo wrote at `place`, a file or folder in an output folder, except the files in `keep`.
+
+    Files of others stay; folders that become empty are removed.
+    """
+    owner = _owner(place)
+    if owner is not None:
+        kept = {_entry(path, owner) for path in keep}
+        below = _entry(place, owner)
+        names = ledger(owner)
+        gone = [name for name in names if (name == below or name.startswith(f"{below}/")) and name not in kept]
+        if gone:
+            remove_listed(owner, gone)
+            write_ledger(owner, [name for name in names if name not in gone])
+
+
+def remove_listed(owner: Path, names: Iterable[str]) -> None:
+    """Remove files of an output folder by their names in its ledger, and the folders that become empty."""
+    paths = [owner / name for name in names]
+    for path in paths:
+        # A folder that has become a link to another place is not followed.
+        if _is_below(path.parent, owner) and (path.is_symlink() or path.is_file() or is_part(path)):
+            _remove(path)
+    inner = {folder for path in paths for folder in path.parents if owner in folder.parents}
+    for folder in sorted(inner, key=lambda f: len(f.parts), reverse=True):
+        if folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def remove_parts(owner: Path) -> None:
+    """Remove the half-written files and folders of a process that was killed."""
+    remove_listed(owner, [name for name in ledger(owner) if is_part(Path(name))])
+
+
+def is_part(path: Path) -> bool:
+    """Whether a path has the name of something half-written."""
+    return _PART.fullmatch(path.name) is not None
+
+
+def _owner(path: Path) -> Path | None:
+    """Return the output folder that a path is in: the nearest one that holds the state of a run or a ledger."""
+    parents = path.absolute().parents
+    return next((f for f in parents if (f / RUN_FILE).is_file() or (f / LEDGER_FILE).is_file()), None)
+
+
+def _is_below(folder: Path, owner: Path) -> bool:
+    return folder.resolve().is_relative_to(owner.resolve())
+
+
+def _entry(path: Path, owner: Path) -> str:
+    return (path.parent.resolve() / path.name).relative_to(owner.resolve()).as_posix()
+
+
+def _enter_in_ledger(paths: Iterable[Path]) -> None:
+    """Add files, all in one folder tree, to the ledger of the output folder that they are in, if they are in one."""
+    for path in paths:
+        owner = _owner(path)
+        if owner is not None and path.name not in OWN_FILES:
+            with (owner / LEDGER_FILE).open("a", encoding="utf-8", errors="surrogateescape") as file:
+                file.write(_entry(path, owner) + "\n")
 
 
 def as_json(value: Any) -> Any:

@@ -30,6 +30,8 @@ from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.base import DEFAULT_FORMATS
 from freegeo.export.formats import export, filter_reconstruction
 from freegeo.export.kept import Filtered, save_kept
+from freegeo.export.photos import FOLDER as COPIES_FOLDER
+from freegeo.export.photos import photo_records
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import FILE_NAME as PREDICTION_NAME
 from freegeo.export.reconstruction import Reconstruction
@@ -50,10 +52,10 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 SUMMARY_NAME = "reconstruction.json"
-FROZEN_FOLDER, ADAPTER_FOLDER, FRAMES_FOLDER = "frozen", "adapter", "images"
+FROZEN_FOLDER, ADAPTER_FOLDER = "frozen", "adapter"
 FILES_STAGE = "points and files"
 ADAPTATION = Part("adaptation", (f"{ADAPTER_FOLDER}/",))
-PREDICTION = Part("prediction", (f"{FROZEN_FOLDER}/{PREDICTION_NAME}", PREDICTION_NAME, f"{FRAMES_FOLDER}/"))
+PREDICTION = Part("prediction", (f"{FROZEN_FOLDER}/{PREDICTION_NAME}", PREDICTION_NAME, f"{COPIES_FOLDER}/"))
 FILTERS = Part("filters", ("",), free=True)
 FORMATS = Part("formats", (), free=True)
 PARTS = (ADAPTATION, PREDICTION, FILTERS, FORMATS)
@@ -299,6 +301,8 @@ class Job:
     """Reference-view rule of all predictions; None: the model's own."""
     formats: Sequence[str] = DEFAULT_FORMATS
     """Files to write besides the predictions, names of `freegeo.export.formats.FORMATS`."""
+    photos: Sequence[PhotoLike] | None = None
+    """The photos of the batch, of which some formats write copies."""
     filters: FilterSettings = field(default_factory=FilterSettings)
     masks: list[np.ndarray] | None = None
     """One (H, W) array per photo at its size, not zero where points are wanted."""
@@ -338,8 +342,8 @@ class Job:
             final = self._predicted(self.folder.path, "adapted prediction" if self.adapter else "prediction")
         if rejected is not None:
             self._warn(f"{rejected} The result is that of the frozen model.")
-        report = self._export(final, frozen)
-        summary = self._summary(final, frozen, report, rejected)
+        report, failed = self._export(final, frozen)
+        summary = self._summary(final, frozen, report, rejected, failed)
         write_json(self.folder / SUMMARY_NAME, summary)
         self.after(self)
         self.hooks.stage("report")
@@ -401,18 +405,26 @@ class Job:
         if sentence not in self.warnings:
             self.warnings.append(sentence)
 
-    def _export(self, final: Reconstruction, frozen: Reconstruction | None) -> FilterReport | None:
-        """Filter each reconstruction once and write all formats; None without cameras, which have no points."""
-        if not final.has_cameras:
-            return None
+    def _export(
+        self, final: Reconstruction, frozen: Reconstruction | None
+    ) -> tuple[FilterReport | None, Mapping[str, str]]:
+        """Filter each reconstruction once and write all formats.
+
+        Returns what the filters removed (None without cameras, which have no points), and why formats were not written.
+        """
         with self._timed(FILES_STAGE):
             masks = None if self.masks is None else masks_for_model(final, self.masks)
-            if frozen is not None:
-                save_kept(self.folder / FROZEN_FOLDER, self._filtered(frozen, masks))
-            filtered = self._filtered(final, masks)
-            save_kept(self.folder.path, filtered)
-            export(final, self.folder.path, self.formats, filtered=filtered, seed=self.seed)
-        return filtered[1]
+            filtered = None
+            if final.has_cameras:
+                if frozen is not None:
+                    save_kept(self.folder / FROZEN_FOLDER, self._filtered(frozen, masks), masks)
+                filtered = self._filtered(final, masks)
+                save_kept(self.folder.path, filtered, masks)
+            exported = export(
+                final, self.folder.path, self.formats, filtered=filtered, masks=masks, photos=self.photos,
+                seed=self.seed,
+            )  # fmt: skip
+        return None if filtered is None else filtered[1], exported.failed
 
     def _filtered(self, reconstruction: Reconstruction, masks: np.ndarray | None) -> Filtered:
         return filter_reconstruction(reconstruction, masks=masks, settings=self.filters)
@@ -423,6 +435,7 @@ class Job:
         frozen: Reconstruction | None,
         report: FilterReport | None,
         rejected: str | None,
+        failed: Mapping[str, str],
     ) -> dict[str, Any]:
         trained = self.recipe is not None and rejected is None
         settings = dict(self.folder.settings)
@@ -433,11 +446,13 @@ class Job:
             "checkpoint": self.checkpoint,
             "licence_of_weights": self.spec.weights_licence,
             "images": list(final.names),
+            "photo_files": None if self.photos is None else photo_records(self.photos),
             "image_hw": list(final.image_hw),
             "adapter": ADAPTER_FOLDER if trained else (str(self.adapter) if self.adapter else None),
             "rejected_adapter": rejected,
             "frozen_prediction": f"{FROZEN_FOLDER}/{PREDICTION_NAME}" if frozen is not None else None,
             "reference_view": self.reference or self.spec.reference,
+            "not_written": dict(failed),
             "warnings": list(self.warnings),
             "loss": self._loss_change(),
             "filters": None if report is None else {"pixels": report.pixels, "removed": dict(report.removed)},

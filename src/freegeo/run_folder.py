@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -25,22 +24,27 @@ from freegeo.files import (
     OWN_FILES,
     RUN_FILE,
     as_json,
-    atomic_path,
+    is_part,
+    ledger,
     read_json,
+    remove_listed,
+    remove_parts,
     write_json,
+    write_ledger,
 )  # fmt: skip
 
 _SHOWN = 4
-_PART = re.compile(r"\..+\.[0-9a-f]{8}\.part(\..*)?")
 
 
 @contextmanager
 def locked(folder: Path) -> Generator[None]:
     """Lock a folder against other processes; the system releases the lock when the process ends.
 
-    UserError when the folder cannot be made or written to, or when another process holds it.
+    A folder that is made here and stays empty is removed again. UserError when the folder cannot be made or written
+    to, or when another process holds it.
     """
     lock = folder / LOCK_FILE
+    is_new = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         handle = lock.open("a+b")
@@ -56,6 +60,8 @@ def locked(folder: Path) -> Generator[None]:
             yield
         finally:
             lock.unlink(missing_ok=True)
+            if is_new and not any(folder.iterdir()):
+                folder.rmdir()
 
 
 def _is_same_file(handle, path: Path) -> bool:
@@ -155,21 +161,17 @@ def run_folder(
     """
     settings = as_json(settings)
     check_folder(path, settings, overwrite=overwrite, parts=parts, labels=labels)
-    is_new = not path.exists()
-    try:
-        with locked(path):
-            # The state is read again under the lock: another process may have changed it since the check.
-            check_folder(path, settings, overwrite=overwrite, parts=parts, labels=labels)
-            folder = _open(path, settings, overwrite, parts)
-            try:
-                yield folder
-            except UserError:
-                if not _ledger(path):
-                    (path / RUN_FILE).unlink(missing_ok=True)
-                raise
-    finally:
-        if is_new and path.is_dir() and not any(path.iterdir()):
-            path.rmdir()
+    with locked(path):
+        # The state is read again under the lock: another process may have changed it since the check.
+        check_folder(path, settings, overwrite=overwrite, parts=parts, labels=labels)
+        folder = _open(path, settings, overwrite, parts)
+        try:
+            yield folder
+        except UserError:
+            if not any((path / name).exists() for name in ledger(path)):
+                (path / RUN_FILE).unlink(missing_ok=True)
+                (path / LEDGER_FILE).unlink(missing_ok=True)
+            raise
 
 
 def _open(path: Path, settings: Mapping[str, Any], overwrite: bool, parts: Sequence[Part]) -> RunFolder:
@@ -179,7 +181,7 @@ def _open(path: Path, settings: Mapping[str, Any], overwrite: bool, parts: Seque
         same = before["settings"] == settings
         if same and not overwrite:
             if not before["finished"]:
-                _remove_parts(path)
+                remove_parts(path)
             return RunFolder(path, settings, before["finished"], before.get("notes") or {})
         kept = [] if same else parts[: _unchanged(before["settings"], settings, parts)]
         clear(path, keep=lambda name: any(part.owns(name) for part in kept))
@@ -243,20 +245,11 @@ def clear(path: Path, *, keep: Callable[[str], bool] = lambda name: False) -> No
     if state is not None:
         # If the removal is interrupted, the remaining files must not count as a finished result.
         write_json(path / RUN_FILE, {**state, "finished": None})
-    names = _ledger(path)
-    files = [path / name for name in names if not keep(name)]
-    for file in files:
-        if file.is_symlink() or file.is_file():
-            file.unlink()
-    _remove_parts(path)
-    inner = {folder for file in files for folder in file.parents if path in folder.parents}
-    for folder in sorted(inner, key=lambda f: len(f.parts), reverse=True):
-        if folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
-    kept = [name for name in names if keep(name)]
+    names = ledger(path)
+    kept = [name for name in names if keep(name) and not is_part(Path(name))]
+    remove_listed(path, set(names) - set(kept))
     if kept:
-        with atomic_path(path / LEDGER_FILE) as part:
-            part.write_text("".join(f"{name}\n" for name in kept), encoding="utf-8")
+        write_ledger(path, kept)
     else:
         (path / LEDGER_FILE).unlink(missing_ok=True)
 
@@ -271,21 +264,6 @@ def difference(before: Mapping[str, Any], now: Mapping[str, Any], labels: Mappin
     parts = list(dict.fromkeys(_differences(before, now, labels or {})))
     more = len(parts) - _SHOWN
     return "; ".join(parts[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
-
-
-def _ledger(path: Path) -> list[str]:
-    """Names of the files that freegeo wrote below a folder, each once."""
-    file = path / LEDGER_FILE
-    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
-    return [name for name in dict.fromkeys(lines) if ".." not in Path(name).parts and not Path(name).is_absolute()]
-
-
-def _remove_parts(path: Path) -> None:
-    """Remove the half-written files of a process that was killed."""
-    for folder in {path, *((path / name).parent for name in _ledger(path))}:
-        for file in folder.glob(".*.part*"):
-            if _PART.fullmatch(file.name):
-                file.unlink()
 
 
 def _state(settings: Mapping[str, Any], finished: str | None, notes: Mapping[str, Any]) -> dict[str, Any]:

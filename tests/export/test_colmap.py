@@ -7,8 +7,9 @@ from exact_rooms import PHOTO_SCALE, room
 from freegeo.data.procedural import render, sample_rooms
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.colmap import FOLDER, write_colmap
-from freegeo.export.formats import export
+from freegeo.export.formats import FORMATS, check_formats, export
 from freegeo.export.pixels import corner_K, corner_pixels
+from freegeo.files import LEDGER_FILE, atomic_folder, keep_ledger
 from freegeo.fusion.tracks import build_tracks
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs the extra colmap")
@@ -24,9 +25,9 @@ def tracks_of(scene, **options):
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
     folder = tmp_path_factory.mktemp("colmap")
-    files = export(room(VIEWS, HW, SEED, CROP), folder, ["colmap"], max_tracks=4000)
-    assert {f.name for f in files} >= {"cameras.bin", "images.bin", "points3D.bin"}
-    assert all(f.is_file() and f.parent == folder / FOLDER for f in files)
+    files = export(room(VIEWS, HW, SEED, CROP), folder, ["colmap"], max_tracks=4000).files
+    assert {f.name for f in files} >= {"cameras.bin", "images.bin", "points3D.bin", "README.txt"}
+    assert all(f.is_file() and f.parent in (folder / FOLDER, folder / "colmap") for f in files)
     assert [p.name for p in (folder / FOLDER).parent.iterdir()] == ["0"], "no temporary folder is left"
     return pycolmap.Reconstruction(folder / FOLDER)
 
@@ -138,14 +139,35 @@ def test_the_corner_rule_undoes_resize_and_crop():
     )
 
 
-def test_a_model_replaces_the_one_before(tmp_path):
+@pytest.mark.parametrize("noted", [False, True])
+def test_a_model_replaces_the_one_before_and_spares_other_files(tmp_path, noted):
+    if noted:
+        keep_ledger(tmp_path)
     scene = room(VIEWS, HW, SEED, CROP)
-    tracks = tracks_of(scene, max_points=50)
-    write_colmap(scene, tracks, tmp_path / "0")
-    (tmp_path / "0" / "stale.ply").write_text("from the model before")
-    write_colmap(scene, tracks_of(scene, max_points=20), tmp_path / "0")
+    first = write_colmap(scene, tracks_of(scene, max_points=50), tmp_path / "0")
+    (tmp_path / "0" / "project.ini").write_text("mine")
+    again = write_colmap(scene, tracks_of(scene, max_points=20), tmp_path / "0")
     assert pycolmap.Reconstruction(tmp_path / "0").num_points3D() == 20
-    assert not (tmp_path / "0" / "stale.ply").exists()
+    assert again == first
+    assert set((tmp_path / "0").iterdir()) == {*again, tmp_path / "0" / "project.ini"}
+    assert {p.name for p in tmp_path.iterdir()} == {"0"} | ({LEDGER_FILE} if noted else set())
+
+
+def test_files_that_an_older_pycolmap_wrote_do_not_mix_with_new_ones(tmp_path):
+    keep_ledger(tmp_path)
+    with atomic_folder(tmp_path / "0") as part:
+        (part / "points.old").write_text("")
+    scene = room(VIEWS, HW, SEED, CROP)
+    new = write_colmap(scene, tracks_of(scene, max_points=20), tmp_path / "0")
+    assert set((tmp_path / "0").iterdir()) == set(new)
+
+
+def test_the_export_says_what_bundle_adjustment_cannot_do(tmp_path, caplog):
+    caplog.set_level("INFO")
+    export(room(VIEWS, HW, SEED, CROP), tmp_path, ["colmap"], max_tracks=20)
+    for text in (caplog.text, (tmp_path / "colmap" / "README.txt").read_text()):
+        assert "bundle adjustment" in text.lower() and "cannot improve" in text
+    assert "not measured" in FORMATS["colmap"].about
 
 
 def test_failures_are_one_sentence_and_leave_nothing(tmp_path, monkeypatch):
@@ -156,6 +178,8 @@ def test_failures_are_one_sentence_and_leave_nothing(tmp_path, monkeypatch):
     with pytest.raises(FreeGeoError, match="no point is seen by two views"):
         write_colmap(scene, nothing, tmp_path / "0")
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(UserError, match=r"pip install 'freegeo\[colmap\]'"):
+    with pytest.raises(FreeGeoError, match=r"pip install 'freegeo\[colmap\]'"):
         write_colmap(scene, tracks_of(scene, max_points=20), tmp_path / "0")
+    with pytest.raises(UserError, match=r"pip install 'freegeo\[colmap\]'"):
+        check_formats(["ply", "colmap"], scene.names)
     assert list(tmp_path.iterdir()) == []

@@ -9,28 +9,42 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from exact_rooms import PHOTO_SCALE, room
+from freegeo.data.photos import MemoryPhoto
 from freegeo.data.procedural import render, sample_rooms
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.depth_png import depth_names, write_depth
-from freegeo.export.formats import FORMATS, export, filter_reconstruction
+from freegeo.export.formats import FORMATS, check_formats, chosen_formats, export, filter_reconstruction
 from freegeo.export.mesh import fuse, voxel_size, write_mesh
 from freegeo.export.nerfstudio import opengl_camera_to_world
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import Reconstruction
+from freegeo.files import LEDGER_FILE
 from freegeo.fusion.settings import FilterSettings
 from freegeo.geometry.depth import depth_to_world
 
 EVERYTHING = FilterSettings(drop_share=0, flying=False, multi_view=False)
+NOTHING = FilterSettings(min_agreeing=50, min_asked=0)
+
+
+def names_in(folder):
+    """Everything in a folder but the ledger."""
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} - {LEDGER_FILE}
+
+
+def photos_of(scene):
+    return [
+        MemoryPhoto(name, np.full((*hw, 3), 40 * i, np.uint8))
+        for i, (name, hw) in enumerate(zip(scene.names, scene.photo_hw.tolist(), strict=True))
+    ]
 
 
 def test_every_format_is_written_once_and_points_are_shared(tmp_path):
     pytest.importorskip("pycolmap", reason="needs the extra colmap")
     scene = room()
-    written = export(scene, tmp_path, [*FORMATS, "ply"], max_points=500, max_tracks=100)
+    written = export(scene, tmp_path, [*FORMATS, "ply"], max_points=500, max_tracks=100).files
     assert len(set(written)) == len(written)
     assert all(path.is_file() for path in written)
-    on_disk = {p.relative_to(tmp_path) for p in tmp_path.rglob("*") if p.is_file()}
-    assert on_disk == {p.relative_to(tmp_path) for p in written}
+    assert names_in(tmp_path) == {p.relative_to(tmp_path).as_posix() for p in written}
     assert len(trimesh.load(tmp_path / "points.ply").vertices) == 500
     assert len(trimesh.load(tmp_path / "scene.glb").geometry["points"].vertices) == 500
     np.testing.assert_array_equal(Reconstruction.load(tmp_path).depth_z, scene.depth_z)
@@ -38,7 +52,7 @@ def test_every_format_is_written_once_and_points_are_shared(tmp_path):
 
 def test_all_stands_for_every_format_and_each_is_where_it_says(tmp_path):
     pytest.importorskip("pycolmap", reason="needs the extra colmap")
-    written = room().export(str(tmp_path), ["ply", "all"], max_points=100, max_tracks=50)
+    written = room().export(str(tmp_path), ["ply", "all"], max_points=100, max_tracks=50).files
     for format in FORMATS.values():
         place = tmp_path / format.path
         assert any(path == place or place in path.parents for path in written), format.name
@@ -51,14 +65,17 @@ def test_only_formats_without_points_can_do_without_cameras(tmp_path):
             with pytest.raises(UserError, match="no cameras"):
                 flat.export(tmp_path, [format.name])
         else:
-            assert flat.export(tmp_path / format.name, [format.name])
+            assert flat.export(tmp_path / format.name, [format.name]).files
+    assert {p.name for p in flat.export(tmp_path / "all", ["all"]).files} >= {"prediction.npz", "depth.json"}
 
 
 def test_a_reconstruction_exports_what_its_filters_and_masks_leave(tmp_path):
     scene = room()
     masks = [np.zeros(tuple(hw), np.uint8) for hw in scene.photo_hw]
     masks[1][20:40, 20:40] = 1
-    assert room().export(tmp_path / "default") == [tmp_path / "default" / n for n in ("points.ply", "scene.glb")]
+    default = room().export(tmp_path / "default")
+    assert default.files == [tmp_path / "default" / n for n in ("points.ply", "scene.glb")]
+    assert default.failed == {}
     scene.export(tmp_path, ["ply"], filters=EVERYTHING, masks=masks)
     kept, _ = filter_reconstruction(scene, masks=masks_for_model(scene, masks), settings=EVERYTHING)
     assert 0 < len(trimesh.load(tmp_path / "points.ply").vertices) == kept.sum() < kept.size / 10
@@ -78,23 +95,124 @@ def test_filters_decide_what_is_exported(tmp_path):
 def test_bad_requests(tmp_path):
     with pytest.raises(UserError, match=r"Unknown export format 'obj'\. Choose from npz, ply"):
         export(room(), tmp_path, ["npz", "obj"])
+    for names in ([], [""], [","]):
+        with pytest.raises(UserError, match=r"No export format is named\. Choose from npz, ply"):
+            export(room(), tmp_path, names)
+    for values in ({"voxel": 0.0}, {"max_points": 0}, {"max_tracks": -1}):
+        with pytest.raises(UserError, match="must be"):
+            export(room(), tmp_path, ["npz", "ply"], **values)
     flat = replace(room(), T_cam_world=None, K=None)
     with pytest.raises(UserError, match="no cameras"):
-        export(flat, tmp_path, ["npz", "ply"])
+        flat.export(tmp_path, ["npz", "ply"])
     assert list(tmp_path.iterdir()) == []
-    assert {p.name for p in export(flat, tmp_path, ["npz", "depth"])} >= {"prediction.npz", "depth.json"}
+
+
+@pytest.mark.parametrize("names", [["ply,glb"], ["ply, glb"], ["PLY", "glb"], [" ply ", "glb,ply"], ["ply,", ",glb"]])
+def test_formats_may_be_separated_by_commas(names):
+    assert chosen_formats(names) == ["ply", "glb"]
+
+
+def test_a_format_that_can_never_be_written_is_refused_but_left_out_of_all(caplog):
+    assert "colmap" in check_formats(["all"], ["a.jpg", "b.jpg"])
+    with pytest.raises(UserError, match="there is one photo"):
+        check_formats(["all", "colmap"], ["a.jpg"])
+    assert check_formats(["all"], ["a.jpg"]) == [name for name in FORMATS if name != "colmap"]
+    assert "'all' leaves out colmap: a COLMAP model needs points that two views see" in caplog.text
+
+
+def nothing_kept(scene):
+    return filter_reconstruction(scene, settings=NOTHING)
+
+
+def test_formats_with_nothing_to_write_do_not_cost_the_others(tmp_path, caplog):
+    pytest.importorskip("pycolmap", reason="needs the extra colmap")
+    scene = room()
+    result = export(scene, tmp_path, ["all"], filtered=nothing_kept(scene))
+    assert list(result.failed) == ["ply", "glb", "mesh", "colmap"]
+    assert {p.name for p in result.files} >= {"prediction.npz", "transforms.json", "depth.json"}
+    for format, reason in result.failed.items():
+        assert "multi-view" in reason and "Loosen the filters" in reason
+        assert f"Format {format} is not written: {reason}" in caplog.text
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    assert "ply_file_path" not in content
+    assert len(content["frames"]) == len(scene)
+    with pytest.raises(FreeGeoError, match="nothing was written: no point is left"):
+        scene.export(tmp_path, ["ply"], filters=NOTHING)
+
+
+def test_depth_that_is_not_a_number_is_not_called_a_matter_of_filters(tmp_path):
+    lost = replace(room(), depth_z=np.full_like(room().depth_z, np.nan))
+    filtered = filter_reconstruction(lost, settings=EVERYTHING)
+    result = export(lost, tmp_path, ["npz", "ply", "depth", "mesh"], filtered=filtered)
+    assert list(result.failed) == ["ply", "depth", "mesh"]
+    assert all("no depth of the prediction is usable" in reason for reason in result.failed.values())
+
+
+def test_without_cameras_the_formats_that_need_none_are_written(tmp_path):
+    flat = replace(room(), T_cam_world=None, K=None)
+    result = export(flat, tmp_path, ["ply", "depth"])
+    assert list(result.failed) == ["ply"]
+    assert names_in(tmp_path) == {"depth/depth.json", *(f"depth/photo {i}.png" for i in range(4))}
+
+
+# -- nothing of an earlier export is left
+
+
+def test_exports_replace_earlier_ones_and_spare_other_files(tmp_path):
+    scene = room()
+    export(scene, tmp_path, ["depth", "ply", "glb"])
+    (tmp_path / "depth" / "mine.png").write_text("mine")
+    (tmp_path / "mesh.ply").write_text("mine")
+    renamed = replace(scene, names=("other.jpg", *scene.names[1:]))
+    filtered = nothing_kept(scene)
+    assert list(export(renamed, tmp_path, ["depth", "ply", "mesh"], filtered=filtered).failed) == ["ply", "mesh"]
+    maps = {"other.png", *(f"photo {i}.png" for i in range(1, 4))}
+    assert names_in(tmp_path) == {"scene.glb", "mesh.ply", "depth/mine.png", "depth/depth.json"} | {
+        f"depth/{name}" for name in maps
+    }
+    assert (tmp_path / "mesh.ply").read_text() == "mine"
+
+
+def test_names_that_lead_out_of_the_folder_are_refused_before_anything_is_written(tmp_path):
+    scene, out = room(), tmp_path / "out"
+    for name in ("../x.jpg", "/x.jpg", "a/../../x.jpg", "..", "", "a\nb.jpg"):
+        bad = replace(scene, names=(name, *scene.names[1:]))
+        for format in ("depth", "nerfstudio", "colmap"):
+            with pytest.raises(UserError, match="cannot be the name of a file"):
+                export(bad, out, ["npz", format])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("length", [200, 251, 255])
+def test_long_names_fit(tmp_path, length):
+    stems = [("客厅" * 60)[: (length - 5) // 3] + str(i) for i in range(4)]
+    scene = replace(room(), names=tuple(f"{s}{'x' * (length - 4 - len(s.encode()))}.tif" for s in stems))
+    assert {len(name.encode()) for name in scene.names} == {length}
+    export(scene, tmp_path, ["depth", "nerfstudio"], photos=photos_of(scene))
+    maps = json.loads((tmp_path / "depth" / "depth.json").read_text())["maps"]
+    assert list(maps) == list(scene.names)
+    assert all((tmp_path / "depth" / name).is_file() for name in maps.values())
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    assert all((tmp_path / frame["file_path"]).is_file() for frame in frames)
+
+
+def test_names_that_would_become_too_long_are_cut_and_stay_apart():
+    names = [f"{'x' * 251}.jpg", f"{'x' * 251}.png", f"{'x' * 250}y.png"]
+    cut = depth_names(names)
+    assert len(set(cut)) == 3
+    assert all(len(name) == 255 and name.endswith(".png") for name in cut)
 
 
 def test_nerfstudio_cameras_project_points_to_the_photos(tmp_path):
     scene = room(4, (48, 64), 7, 5)
-    export(scene, tmp_path, ["nerfstudio"], photo_folder="../photos", max_points=100)
+    export(scene, tmp_path, ["nerfstudio"], max_points=100)
     content = json.loads((tmp_path / "transforms.json").read_text())
     assert content["camera_model"] == "OPENCV"
     assert (tmp_path / content["ply_file_path"]).is_file()
     photos = render(sample_rooms([7], frames=4), 48 * PHOTO_SCALE, 64 * PHOTO_SCALE)
     world = depth_to_world(photos.depth_z[0], photos.K[0], photos.T_cam_world[0])
     for view, frame in enumerate(content["frames"]):
-        assert frame["file_path"] == f"../photos/{scene.names[view]}"
+        assert frame["file_path"] == f"images/{scene.names[view]}"
         assert (frame["h"], frame["w"]) == (96, 128)
         row, column = 30, 70
         point = np.append(world[view, row, column].numpy(), 1.0)
@@ -128,7 +246,23 @@ def test_depth_maps_come_back_within_half_a_step(tmp_path):
 
 def test_depth_names_stay_apart():
     assert depth_names(("a.jpg", "sub/b.JPG")) == ["a.png", "sub/b.png"]
-    assert depth_names(("a.jpg", "a.png")) == ["a.jpg.png", "a.png.png"]
+    assert depth_names(("a.jpg", "a.png")) == ["a.jpg.png", "a.png"]
+    assert depth_names(("a.jpg", "a.png", "a.jpg.png")) == ["a.jpg.png", "a.png.png", "a.jpg.png.png"]
+
+
+def test_depth_maps_follow_the_masks_but_not_the_filters_and_say_so(tmp_path):
+    scene = room()
+    masks = [np.zeros(tuple(hw), np.uint8) for hw in scene.photo_hw]
+    masks[1][20:40, 20:40] = 1
+    flat = replace(scene, T_cam_world=None, K=None)
+    for name, cameras, formats in (("posed", scene, ["depth", "glb"]), ("flat", flat, ["depth"])):
+        cameras.export(tmp_path / name, formats, masks=masks, filters=NOTHING)
+        content = json.loads((tmp_path / name / "depth" / "depth.json").read_text())
+        assert "outside the masks" in content["meaning"] and "not applied" in content["meaning"]
+        with Image.open(tmp_path / name / "depth" / content["maps"][scene.names[1]]) as image:
+            np.testing.assert_array_equal(np.array(image) > 0, masks_for_model(scene, masks)[1])
+        with Image.open(tmp_path / name / "depth" / content["maps"][scene.names[0]]) as image:
+            assert not np.array(image).any()
 
 
 def test_the_mesh_of_exact_depth_is_the_room(tmp_path):

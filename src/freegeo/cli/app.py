@@ -21,14 +21,14 @@ from typing import TYPE_CHECKING, Any
 
 from freegeo import __version__
 from freegeo.cli import console
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import FreeGeoError, PartialResultError, UserError
 
 if TYPE_CHECKING:
     from cyclopts import App
 
 ABOUT = "Adapt feed-forward 3D models to your scene at test time."
 GLOBAL = "Every command takes --config FILE.toml (a table of options per command) and -v for more messages."
-USER_MISTAKE, FAILURE, INTERRUPTED = 2, 1, 130
+USER_MISTAKE, FAILURE, PARTIAL, INTERRUPTED = 2, 1, 3, 130
 
 COMMANDS = {
     "demo": ("freegeo.cli.demo:demo", "Photograph a generated room, adapt to it, score before and after."),
@@ -72,7 +72,10 @@ def build(config: Path | None = None) -> App:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command line; returns the exit code (0, 2 for the user's mistake, 1 for a failure, 130 for Ctrl-C)."""
+    """Run a command line and return the exit code.
+
+    0: done; 2: the user's mistake; 1: a failure; 3: everything was written but for some files; 130: Ctrl-C.
+    """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     # The parser takes longer to load than these two take to answer.
     if arguments in ([], ["-h"], ["--help"]):
@@ -97,6 +100,8 @@ def run_command(arguments: Sequence[str]) -> int:
         return console.fail(one_line(str(error)), USER_MISTAKE)
     except UserError as error:
         return console.fail(str(error), USER_MISTAKE)
+    except PartialResultError as error:
+        return console.fail(str(error), PARTIAL)
     except FreeGeoError as error:
         return console.fail(str(error), FAILURE)
     except KeyboardInterrupt:

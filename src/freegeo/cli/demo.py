@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from freegeo.cli import console
-from freegeo.cli.jobs import run_job, save_frames
+from freegeo.cli.jobs import run_job
 from freegeo.cli.options import DemoModelOptions, OutputOptions, RecipeOptions
 from freegeo.cli.sources import DEMO_DOMAIN, demo_scene
+from freegeo.export.photos import write_copies
 from freegeo.files import read_json, write_json
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def demo(
     target = OutputOptions(output=output, overwrite=overwrite)
 
     def add_scores(job: Job) -> None:
-        save_frames(scene.photos, output / "photos")
+        write_copies(scene.photos, output / "photos")
         true_reconstruction(job, scene).save(output / "truth")
         write_json(output / SCORES_NAME, score_windows(job, scene))
 

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from freegeo.cli import console
-from freegeo.cli.files import FORMAT_NAMES, FilterOptions
+from freegeo.cli.files import FORMAT_NAMES, FilterOptions, require_complete
+from freegeo.errors import UserError
 from freegeo.export.base import MAX_TRACKS
 from freegeo.fusion.settings import MAX_POINTS
 
-DEFAULT_FILTERS = FilterOptions()
+if TYPE_CHECKING:
+    import numpy as np
+
+    from freegeo.data.photos import Photo
+    from freegeo.export.reconstruction import Reconstruction
 
 
 def export(
@@ -24,18 +29,19 @@ def export(
     max_points: int = MAX_POINTS,
     max_tracks: int = MAX_TRACKS,
     voxel: float | None = None,
-    filters: FilterOptions = DEFAULT_FILTERS,
+    filters: FilterOptions | None = None,
 ) -> None:
     """Write a reconstruction in other formats.
 
     Parameters
     ----------
     source
-        Folder that `run` or `reconstruct` wrote.
+        Folder that `run` or `reconstruct` wrote, or a prediction.npz. The points are those that the run kept, unless
+        an option of the filters below is given; then all filters run again.
     output
-        Folder for the files; default: the reconstruction's own.
+        Folder for the files; default: that of the prediction.
     frozen
-        Export the prediction before adaptation.
+        Export the prediction before adaptation (default output: frozen/ in the folder).
     max_points
         Most points in point clouds.
     max_tracks
@@ -44,20 +50,86 @@ def export(
         Voxel edge of the mesh, in the reconstruction's units; default: from its resolution.
     """
     from freegeo.export import formats
+    from freegeo.export.kept import load_kept, load_masks
     from freegeo.export.pixels import masks_for_model
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.pipeline import FROZEN_FOLDER
+    from freegeo.run_folder import locked
 
-    reconstruction = Reconstruction.load(source / FROZEN_FOLDER if frozen else source)
-    masks = filters.load_masks(
-        reconstruction.names, [(int(h), int(w)) for h, w in reconstruction.photo_hw], model_hw=reconstruction.image_hw
-    )
-    wanted = None if masks is None else masks_for_model(reconstruction, masks)
-    filtered = formats.filter_reconstruction(reconstruction, masks=wanted, settings=filters.settings())
-    files = formats.export(
-        reconstruction, output or source, format, filtered=filtered, max_points=max_points, max_tracks=max_tracks,
-        voxel=voxel,
-    )  # fmt: skip
-    console.say(filtered[1].summary())
-    for file in files:
+    source = source.expanduser()
+    stored = source / FROZEN_FOLDER if frozen else source
+    reconstruction = Reconstruction.load(stored)
+    home = stored.parent if stored.is_file() else stored
+    target = home if output is None else output.expanduser()
+    run = result_folder(home)
+    if result_folder(target) not in (None, run):
+        raise UserError(f"{target}: holds another result. Choose another folder for the files (--output).")
+    names = formats.check_formats(format, reconstruction.names, has_cameras=reconstruction.has_cameras)
+    filtered, masks = None, None
+    if filters is None:
+        filtered = load_kept(home, reconstruction.depth_z.shape)
+        masks = None if filtered is None else load_masks(home)
+    else:
+        sizes = [(height, width) for height, width in reconstruction.photo_hw.tolist()]
+        given = filters.load_masks(reconstruction.names, sizes, model_hw=reconstruction.image_hw)
+        masks = None if given is None else masks_for_model(reconstruction, given)
+        if reconstruction.has_cameras:
+            filtered = formats.filter_reconstruction(reconstruction, masks=masks, settings=filters.settings())
+            if target.resolve() == run:
+                require_points_of_report(target, filtered[0])
+    with locked(result_folder(target) or target):
+        result = formats.export(
+            reconstruction, target, names, filtered=filtered, masks=masks,
+            photos=find_photos(reconstruction, run or home), max_points=max_points, max_tracks=max_tracks, voxel=voxel,
+        ).require_any()  # fmt: skip
+    for file in result.files:
         console.say(f"  {file}  {console.size(file)}")
+    require_complete(target, result.failed)
+
+
+def require_points_of_report(folder: Path, keep: np.ndarray) -> None:
+    """Raise UserError when a run's folder would get files with other points than its report and other files show."""
+    from freegeo.export.kept import load_kept
+
+    shown = load_kept(folder, keep.shape)
+    if shown is not None and (shown[0] != keep).any():
+        raise UserError(
+            f"{folder}: its report and other files show other points than these options keep. Give another folder "
+            "(--output), or repeat the command that made it with these options: it writes all files again without "
+            "adapting."
+        )
+
+
+def result_folder(folder: Path) -> Path | None:
+    """Return the output folder of a run that a folder is, or is in; None where it is in none."""
+    from freegeo.files import RUN_FILE
+
+    folder = folder.resolve()
+    return next((parent for parent in (folder, *folder.parents) if (parent / RUN_FILE).is_file()), None)
+
+
+def find_photos(reconstruction: Reconstruction, run: Path) -> list[Photo] | None:
+    """Return the photos of a stored result if all are as they were, or as upright copies in its folder; else None."""
+    from freegeo.data.photos import Photo
+    from freegeo.export import colmap
+    from freegeo.export.photos import FOLDER, content_hash, copy_names
+    from freegeo.files import ledger, read_json
+    from freegeo.pipeline import SUMMARY_NAME
+
+    summary = read_json(run / SUMMARY_NAME) if (run / SUMMARY_NAME).is_file() else {}
+    records = dict(zip(summary.get("images", ()), summary.get("photo_files", ()), strict=False))
+    own = set(ledger(run))
+    photos = []
+    for name, copy, (height, width) in zip(
+        reconstruction.names, copy_names(reconstruction.names), reconstruction.photo_hw.tolist(), strict=True
+    ):
+        record = records.get(name)
+        file = Path(record["file"]) if record else run
+        if not record or not file.is_file() or content_hash(file) != record["sha256"]:
+            places = [f"{folder}{FOLDER}/{copy}" for folder in ("", f"{colmap.FORMAT.path}/")]
+            copied = [run / place for place in places if place in own and (run / place).is_file()]
+            if not copied:
+                return None
+            file = copied[0]
+        photos.append(Photo(name, file, (height, width)))
+    return photos

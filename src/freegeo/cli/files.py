@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from freegeo.errors import PartialResultError
 from freegeo.export.base import DEFAULT_FORMATS
-from freegeo.export.formats import ALL, FORMATS, chosen_formats
+from freegeo.export.formats import ALL, FORMATS, check_formats, chosen_formats
 from freegeo.fusion.settings import FilterSettings
 from freegeo.run_folder import stored_state
 
@@ -39,7 +40,10 @@ def _check_formats(hint: object, names: Sequence[str]) -> None:
 
 
 FORMAT_NAMES = Parameter(
-    consume_multiple=True, validator=_check_formats, help=f"Any of {', '.join(FORMATS)}; or {ALL}."
+    consume_multiple=True,
+    negative="",
+    validator=_check_formats,
+    help=f"Any of {', '.join(FORMATS)}, with spaces or commas between them; or {ALL}.",
 )
 
 
@@ -90,12 +94,24 @@ class FileOptions:
         del values["masks"]
         return {**values, "masks": None if masks is None else _digest(masks)}
 
-    def all_formats(self, output: OutputOptions) -> list[str]:
-        """Return the formats asked for, and those that the folder has already, unless it is overwritten."""
+    def all_formats(self, output: OutputOptions, photos: Sequence[PhotoLike]) -> list[str]:
+        """Return the formats asked for, and those that the folder has already, unless it is overwritten.
+
+        UserError for a format that can never be written for these photos.
+        """
+        asked = check_formats(self.formats, [photo.name for photo in photos])
         before = None if output.overwrite else stored_state(output.output)
         there = [] if before is None else before["settings"].get("formats", [])
-        return chosen_formats([*there, *self.formats])
+        return chosen_formats([*there, *asked])
 
     def checked_masks(self, photos: Sequence[PhotoLike]) -> list[np.ndarray] | None:
         """Read the masks of photos, and refuse what cannot be used before anything is computed."""
         return self.filters.load_masks([photo.name for photo in photos], [photo.size_hw for photo in photos])
+
+
+def require_complete(folder: Path, failed: Mapping[str, str]) -> None:
+    """Raise PartialResultError when formats could not be written."""
+    if failed:
+        raise PartialResultError(
+            f"{folder}: {', '.join(failed)} not written, everything else is there. The warnings say why."
+        )

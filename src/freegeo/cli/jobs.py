@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from freegeo.cli import console
-from freegeo.cli.files import FileOptions
+from freegeo.cli.files import FileOptions, require_complete
 from freegeo.cli.options import ModelOptions, OutputOptions, RecipeOptions
 from freegeo.export import reconstruction as npz
 from freegeo.export.base import KEPT_NAME
 from freegeo.export.formats import FORMATS
+from freegeo.export.photos import FOLDER as COPIES_FOLDER
+from freegeo.export.photos import write_copies
+from freegeo.files import read_json
 from freegeo.progress import step_bar
 from freegeo.run_folder import check_folder, run_folder, stored_state
 
@@ -44,7 +47,7 @@ FILES = {
     KEPT_NAME: "which pixels the filters kept as points",
     "adapter": "the adapter (peft format)",
     **{format.path: format.about for format in FORMATS.values()},
-    "images": "the frames of the video that were used",
+    COPIES_FOLDER: "upright copies of the photos, or the frames of the video that were used",
     "reconstruction.json": "settings, timings, versions, licence of the weights",
 }
 
@@ -77,9 +80,10 @@ def run_job(
     counts as finished.
     """
     from freegeo.data.video import VideoFrame
-    from freegeo.pipeline import FRAMES_FOLDER, PARTS, Job, require_enough_photos, scene_images
+    from freegeo.pipeline import PARTS, SUMMARY_NAME, Job, require_enough_photos, scene_images
 
     check_place(output)
+    formats = files.all_formats(output, photos)
     empty = model_options.build_empty()
     plan = None if recipe is None else recipe.build(empty.spec)
     if plan is not None:
@@ -97,41 +101,31 @@ def run_job(
         "adaptation": adaptation,
         "prediction": {"reference": model_options.reference or empty.spec.reference},
         "filters": files.filter_settings(masks),
-        "formats": files.all_formats(output),
+        "formats": formats,
     }
     options = {"overwrite": output.overwrite, "parts": PARTS, "labels": LABELS}
     with run_folder(output.output, settings, **options) as folder, progress_hooks() as hooks:
         if folder.finished:
             say_finished(output.output, folder.finished_at)
+            require_complete(output.output, read_json(folder / SUMMARY_NAME).get("not_written", {}))
             return
-        save_frames([photo for photo in photos if isinstance(photo, VideoFrame)], folder / FRAMES_FOLDER)
+        write_copies([photo for photo in photos if isinstance(photo, VideoFrame)], folder / COPIES_FOLDER)
         job = Job(
             load=model_options.load, spec=empty.spec, batch=batch, folder=folder, recipe=plan, adapter=adapter,
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
-            command=console.command_line(), warnings=console.warned(), after=after, formats=settings["formats"],
+            command=console.command_line(), warnings=console.warned(), after=after, formats=formats, photos=photos,
             filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity(),
             scene=None if plan is None else lambda model: scene_images("photos", photos, model, plan, batch),
         )  # fmt: skip
-        describe(job.run(), output.output)
+        summary = job.run()
+        describe(summary, output.output)
+    require_complete(output.output, summary["not_written"])
 
 
 def check_place(output: OutputOptions) -> None:
     """Refuse a folder that cannot be used whatever the settings are, before anything is loaded or downloaded."""
     if stored_state(output.output) is None:
         check_folder(output.output, {}, overwrite=output.overwrite)
-
-
-def save_frames(photos: Sequence[PhotoLike], folder: Path) -> None:
-    """Write photos that are in no file of their own as PNG, under the names that exports refer to."""
-    from PIL import Image
-
-    from freegeo.files import atomic_path
-
-    for photo in photos:
-        path = folder / f"{Path(photo.name).stem}.png"
-        if not path.is_file():
-            with atomic_path(path) as part:
-                Image.fromarray(photo.read()).save(part)
 
 
 def adapter_identity(folder: Path) -> dict[str, str]:

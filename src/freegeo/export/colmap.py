@@ -1,21 +1,25 @@
-"""``colmap/sparse/0``: a COLMAP model that splatting and bundle adjustment accept (extra ``colmap``).
+"""``colmap/``: a COLMAP model in ``sparse/0``, and the upright photos it is about in ``images`` (extra ``colmap``).
 
-World and cameras have OpenCV axes in COLMAP too. Cameras are PINHOLE at the original photos' resolution, one per photo;
-images carry the photos' names; pixel centres are at 0.5 (`freegeo.export.pixels`). Sizes and intrinsics of photos with
-an EXIF rotation are those of the upright photo. Every point has two or more observations.
+World and cameras have OpenCV axes in COLMAP too. Cameras are PINHOLE at the photos' resolution, one per photo; images
+carry the names of the copies (`freegeo.export.photos`); pixel centres are at 0.5 (`freegeo.export.pixels`). Every point
+has two or more observations. They are not measured in the photos but projected from the predicted points, so bundle
+adjustment reproduces the predicted cameras and cannot improve them; ``README.txt`` says so beside the model.
 """
 
 from __future__ import annotations
 
-import shutil
-import tempfile
+import logging
+from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.export import photos
 from freegeo.export.base import Export, Format
 from freegeo.export.pixels import corner_K, corner_pixels
 from freegeo.export.reconstruction import Reconstruction
@@ -23,11 +27,26 @@ from freegeo.export.reconstruction import Reconstruction
 if TYPE_CHECKING:
     from freegeo.fusion.tracks import Tracks
 
+logger = logging.getLogger(__name__)
+
 FOLDER = Path("colmap") / "sparse" / "0"
+ABOUT = "COLMAP model; its tracks are projected, not measured"
+NOTICE = """freegeo wrote this COLMAP model from predicted depth and cameras.
+
+sparse/0   cameras, images and points
+images     upright copies of the photos
+
+Use the model with images/ (--image_path), not with the original photos: COLMAP and the trainers of Gaussian splats do
+not turn photos by their EXIF orientation, but these cameras are those of upright photos.
+
+The observations of the points are not measured in the photos. They are the predicted points, projected into the views
+that agree on them. Bundle adjustment of this model reproduces the predicted cameras and cannot improve them. To refine
+the cameras, match features in images/ (feature_extractor, a matcher, point_triangulator with this model), then adjust.
+"""
 
 
 def write_colmap(reconstruction: Reconstruction, tracks: Tracks, folder: Path) -> list[Path]:
-    """Write the binary model to `folder`, replacing the one there, and return its files.
+    """Write the binary model to `folder`, replacing one that freegeo wrote there, and return its files.
 
     Args:
         reconstruction: cameras and photos.
@@ -35,35 +54,20 @@ def write_colmap(reconstruction: Reconstruction, tracks: Tracks, folder: Path) -
         folder: of the model.
 
     Raises:
-        UserError: pycolmap is not installed, or the folder cannot be written to.
-        FreeGeoError: there is no track.
+        UserError: the folder cannot be written to.
+        FreeGeoError: there is no track, or pycolmap cannot be loaded.
     """
-    pycolmap = _pycolmap()
-    if len(tracks) == 0:
-        raise FreeGeoError(f"{folder}: no point is seen by two views. Use photos that overlap, or loosen the filters.")
-    model = _model(pycolmap, reconstruction, tracks)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    except OSError as error:
-        raise UserError(f"{folder}: the folder cannot be written to ({error.strerror}). Choose another one.") from None
-    try:
-        part.chmod(0o755)
-        model.write_binary(str(part))
-        if folder.exists():
-            shutil.rmtree(folder)
-        part.rename(folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return sorted(folder.iterdir())
-
-
-def _pycolmap() -> ModuleType:
     try:
         import pycolmap
-    except ImportError:
-        raise UserError("The COLMAP export needs an extra: pip install 'freegeo[colmap]'.") from None
-    return pycolmap
+    except ImportError as error:
+        raise FreeGeoError(f"pycolmap cannot be loaded ({error}). Run: pip install 'freegeo[colmap]'.") from None
+    if len(tracks) == 0:
+        raise FreeGeoError("no point is seen by two views. Use photos that overlap, or loosen the filters.")
+    model = _model(pycolmap, reconstruction, tracks)
+    with files.atomic_folder(folder) as part:
+        model.write_binary(str(part))
+        names = sorted(path.name for path in part.iterdir())
+    return [folder / name for name in names]
 
 
 def _model(pycolmap: ModuleType, reconstruction: Reconstruction, tracks: Tracks):
@@ -71,7 +75,7 @@ def _model(pycolmap: ModuleType, reconstruction: Reconstruction, tracks: Tracks)
     places = corner_pixels(reconstruction, tracks.view, tracks.pixel)
     position = np.zeros(len(tracks.view), np.int64)  # of each observation in its image's list
     T_cam_world, K = reconstruction.cameras()[0], corner_K(reconstruction)
-    for view, name in enumerate(reconstruction.names):
+    for view, name in enumerate(photos.copy_names(reconstruction.names)):
         number = view + 1  # COLMAP counts from 1
         height, width = (int(side) for side in reconstruction.photo_hw[view])
         params = [K[view, 0, 0], K[view, 1, 1], K[view, 0, 2], K[view, 1, 2]]
@@ -105,16 +109,36 @@ def _rigid(T: np.ndarray) -> np.ndarray:
     return np.concatenate((u @ vh, T[:3, 3:].astype(np.float64)), axis=1)
 
 
+def check(names: Sequence[str]) -> None:
+    """Raise UserError for a single photo, which has no tracks, and where pycolmap is not installed."""
+    photos.check_names(names)
+    if len(names) < 2:
+        raise UserError("a COLMAP model needs points that two views see, and there is one photo. Leave colmap out.")
+    if find_spec("pycolmap") is None:
+        raise UserError("The COLMAP export needs an extra: pip install 'freegeo[colmap]'.")
+
+
 def _write(export: Export) -> list[Path]:
     from freegeo.fusion.tracks import build_tracks
 
+    export.require_pixels()
     r = export.reconstruction
     T_cam_world, K = r.cameras()
     tracks = build_tracks(
         r.depth_z, T_cam_world, K, r.images, export.keep, tolerance=export.tolerance, max_points=export.max_tracks,
         seed=export.seed,
     )  # fmt: skip
-    return write_colmap(r, tracks, export.folder / FOLDER)
+    model = write_colmap(r, tracks, export.folder / FOLDER)
+    root = export.folder / FOLDER.parts[0]
+    copies = export.write_photos(root / photos.FOLDER)
+    notice = root / "README.txt"
+    with files.atomic_path(notice) as part:
+        part.write_text(NOTICE, encoding="utf-8")
+    logger.info(
+        "colmap: the model is about the upright photos in %s/%s, not the original ones. Its tracks are projected, not "
+        "measured, so bundle adjustment cannot improve it.", FOLDER.parts[0], photos.FOLDER,
+    )  # fmt: skip
+    return [*model, *copies, notice]
 
 
-FORMAT = Format(name="colmap", path=FOLDER.parts[0], about="COLMAP model with tracks", write=_write)
+FORMAT = Format(name="colmap", path=FOLDER.parts[0], about=ABOUT, write=_write, check=check)

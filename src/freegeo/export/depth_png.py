@@ -1,20 +1,27 @@
 """``depth/``: one 16-bit PNG per photo at the model's resolution, and ``depth.json`` with the scale.
 
-`depth_z = value * scale`; 0 means no depth. One scale serves all views: the largest depth has the value 65535.
+`depth_z = value * scale`; 0 means no depth. One scale serves all views: the largest depth has the value 65535. The maps
+follow the user's masks, but none of the filters that thin point clouds: low confidence, flying pixels, other views.
 """
 
 from __future__ import annotations
 
-from pathlib import Path, PurePosixPath
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from freegeo import files
 from freegeo.export.base import Export, Format
+from freegeo.export.photos import check_names, new_names
 from freegeo.export.reconstruction import Reconstruction
 
 FOLDER = "depth"
 LARGEST = 65535
+MEANING = (
+    "depth along the optical axis = value * scale; 0: no valid depth, or outside the masks. Filters of points "
+    "(confidence, flying pixels, other views) are not applied."
+)
 
 
 def write_depth(reconstruction: Reconstruction, folder: Path, *, keep: np.ndarray | None = None) -> list[Path]:
@@ -22,7 +29,7 @@ def write_depth(reconstruction: Reconstruction, folder: Path, *, keep: np.ndarra
     from PIL import Image, PngImagePlugin
 
     depth = reconstruction.depth_z
-    valid = np.isfinite(depth) & (depth > 0)
+    valid = reconstruction.valid_pixels()
     if keep is not None:
         valid &= keep
     scale = float(depth[valid].max()) / LARGEST if valid.any() else 1.0
@@ -30,25 +37,25 @@ def write_depth(reconstruction: Reconstruction, folder: Path, *, keep: np.ndarra
     values = np.where(valid, np.clip(np.rint(np.where(valid, depth, 0) / scale), 1, LARGEST), 0).astype(np.uint16)
     text = PngImagePlugin.PngInfo()
     text.add_text("depth_scale", repr(scale))
-    paths = []
-    for name, view in zip(depth_names(reconstruction.names), values, strict=True):
-        with files.atomic_path(folder / name) as part:
-            Image.fromarray(view).save(part, pnginfo=text, compress_level=1)
-        paths.append(folder / name)
     maps = dict(zip(reconstruction.names, depth_names(reconstruction.names), strict=True))
-    meaning = "depth along the optical axis = value * scale; 0: no depth"
-    files.write_json(folder / "depth.json", {"scale": scale, "meaning": meaning, "maps": maps})
+    paths = [files.inside(folder, name) for name in maps.values()]
+    for path, view in zip(paths, values, strict=True):
+        with files.atomic_path(path) as part:
+            Image.fromarray(view).save(part, pnginfo=text, compress_level=1)
+    files.write_json(folder / "depth.json", {"scale": scale, "meaning": MEANING, "maps": maps})
     return [*paths, folder / "depth.json"]
 
 
-def depth_names(names: tuple[str, ...]) -> list[str]:
+def depth_names(names: Sequence[str]) -> list[str]:
     """File names of the maps: the photos' with the suffix .png, added to the old one where photos differ in it only."""
-    short = [str(PurePosixPath(name).with_suffix(".png")) for name in names]
-    return short if len(set(short)) == len(names) else [f"{name}.png" for name in names]
+    return new_names(names, [".png"] * len(names))
 
 
 def _write(export: Export) -> list[Path]:
-    return write_depth(export.reconstruction, export.folder / FOLDER)
+    export.require_depth()
+    return write_depth(export.reconstruction, export.folder / FOLDER, keep=export.masks)
 
 
-FORMAT = Format(name="depth", path=FOLDER, about="16-bit depth images", write=_write, needs_cameras=False)
+FORMAT = Format(
+    name="depth", path=FOLDER, about="16-bit depth images", write=_write, needs_cameras=False, check=check_names
+)

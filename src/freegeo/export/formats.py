@@ -13,15 +13,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from freegeo.errors import UserError
+from freegeo import files
+from freegeo.errors import FreeGeoError, UserError
 from freegeo.export import colmap, depth_png, glb, mesh, nerfstudio, ply
 from freegeo.export import reconstruction as npz
-from freegeo.export.base import MAX_TRACKS, Export, Format
+from freegeo.export.base import MAX_TRACKS, Export, Exported, Format
 from freegeo.fusion.settings import MAX_POINTS, FilterSettings
 
 if TYPE_CHECKING:
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.fusion.filtering import FilterReport
+    from freegeo.types import PhotoLike
 
 logger = logging.getLogger(__name__)
 
@@ -29,16 +31,46 @@ _MODULES = (npz, ply, glb, mesh, colmap, nerfstudio, depth_png)
 FORMATS: dict[str, Format] = {module.FORMAT.name: module.FORMAT for module in _MODULES}
 ALL = "all"
 """Name that selects every format."""
+NO_CAMERAS = "this reconstruction has no cameras, so it has no 3D points. Use a model that predicts cameras."
 
 
 def chosen_formats(names: Iterable[str]) -> list[str]:
-    """Return the names of the chosen formats, each once, `all` resolved; UserError for one that does not exist."""
-    chosen: list[str] = []
-    for name in names:
-        if name != ALL and name not in FORMATS:
-            raise UserError(f"Unknown export format '{name}'. Choose from {', '.join(FORMATS)}.")
-        chosen += FORMATS if name == ALL else [name]
-    return list(dict.fromkeys(chosen))
+    """Return the names of the chosen formats, each once, `all` resolved; a name may be several with commas.
+
+    UserError for one that does not exist, and when none is named.
+    """
+    asked = _single(names)
+    unknown = next((name for name in asked if name != ALL and name not in FORMATS), None)
+    choice = f"Choose from {', '.join(FORMATS)}, or {ALL}."
+    if unknown is not None:
+        raise UserError(f"Unknown export format '{unknown}'. {choice}")
+    if not asked:
+        raise UserError(f"No export format is named. {choice}")
+    return list(dict.fromkeys(format for name in asked for format in (FORMATS if name == ALL else [name])))
+
+
+def _single(names: Iterable[str]) -> list[str]:
+    return [part.strip().lower() for name in names for part in name.split(",") if part.strip()]
+
+
+def check_formats(names: Sequence[str], photos: Sequence[str], *, has_cameras: bool = True) -> list[str]:
+    """Return the names of the formats to write for photos of these names; cheap, so done before anything is computed.
+
+    UserError for a format that can never be written for them. Of `all`, such formats are left out with a warning.
+    """
+    usable = []
+    for name in chosen_formats(names):
+        try:
+            if FORMATS[name].needs_cameras and not has_cameras:
+                raise UserError(NO_CAMERAS)
+            FORMATS[name].check(photos)
+        except UserError as error:
+            if name in _single(names):
+                raise
+            logger.warning("'%s' leaves out %s: %s", ALL, name, error)
+        else:
+            usable.append(name)
+    return usable
 
 
 def filter_reconstruction(
@@ -60,49 +92,93 @@ def export(
     formats: Sequence[str],
     *,
     filtered: tuple[np.ndarray, FilterReport] | None = None,
+    masks: np.ndarray | None = None,
+    photos: Sequence[PhotoLike] | None = None,
     max_points: int | None = MAX_POINTS,
     max_tracks: int | None = MAX_TRACKS,
     voxel: float | None = None,
-    photo_folder: str = "images",
     seed: int = 0,
-) -> list[Path]:
-    """Write a reconstruction in several formats.
+) -> Exported:
+    """Write a reconstruction in several formats; one that has nothing to write is a warning and costs no other.
+
+    What an earlier export wrote in these formats is replaced, and removed where it is not written again; files that
+    freegeo did not write stay.
 
     Args:
         reconstruction: what to write.
         folder: where the files are written.
         formats: names of `FORMATS`, or `all`.
         filtered: result of `filter_reconstruction`; default: filtered here with the default settings.
+        masks: (S, H, W) bool, the user's masks at the model's size, which depth maps follow; None: no masks.
+        photos: the photos, for upright copies in formats that refer to them; None when they are not at hand.
         max_points: of `points.ply` and `scene.glb`; None writes all.
         max_tracks: points of the COLMAP model; None writes all.
         voxel: voxel edge of the mesh in the reconstruction's units; default chosen from its resolution.
-        photo_folder: where nerfstudio finds the original photos, relative to `folder`.
         seed: of the random choice of points.
 
-    Returns:
-        The files written, each once.
-
     Raises:
-        UserError: an unknown format, a missing extra, or 3D formats of a reconstruction without cameras.
-        FreeGeoError: nothing is left to write.
+        UserError: a format that is unknown or can never be written (`check_formats`), a voxel or limit that is not
+            positive, other photos than the reconstruction's, or a folder that cannot be written to.
     """
     from freegeo.fusion.agreement import TOLERANCE_RANGE
 
-    wanted = [FORMATS[name] for name in chosen_formats(formats)]
-    keep, tolerance = np.ones(reconstruction.depth_z.shape, dtype=bool), None
-    if any(format.needs_cameras for format in wanted):
-        keep, report = filtered or filter_reconstruction(reconstruction)
-        tolerance = report.tolerance
+    wanted = [FORMATS[name] for name in check_formats(formats, reconstruction.names)]
+    _check_values(reconstruction, photos, max_points=max_points, max_tracks=max_tracks, voxel=voxel)
+    report = None
+    keep = np.ones(reconstruction.depth_z.shape, dtype=bool) if masks is None else masks
+    if reconstruction.has_cameras and any(format.needs_cameras for format in wanted):
+        keep, report = filtered or filter_reconstruction(reconstruction, masks=masks)
         logger.info("filters: %s", report.summary())
+    folder = Path(folder)
+    files.keep_ledger(folder)
     run = Export(
         reconstruction=reconstruction,
-        folder=Path(folder),
+        folder=folder,
         keep=keep,
-        tolerance=tolerance or TOLERANCE_RANGE[0],
+        masks=masks,
+        filters=report,
+        tolerance=TOLERANCE_RANGE[0] if report is None or report.tolerance is None else report.tolerance,
         max_points=max_points,
         max_tracks=max_tracks,
         voxel=voxel,
-        photo_folder=photo_folder,
+        photos=photos,
         seed=seed,
     )
-    return list(dict.fromkeys(path for format in wanted for path in run.write(format)))
+    written: list[Path] = []
+    failed: dict[str, str] = {}
+    for format in wanted:
+        done = []
+        try:
+            if format.needs_cameras and not reconstruction.has_cameras:
+                raise FreeGeoError(NO_CAMERAS)
+            done = run.write(format)
+        except UserError:
+            raise
+        except FreeGeoError as error:
+            failed[format.name] = str(error)
+            logger.warning("Format %s is not written: %s", format.name, error)
+        files.remove_written(folder / format.path, keep=done)
+        written += done
+    return Exported(files=list(dict.fromkeys(written)), failed=failed)
+
+
+def _check_values(
+    reconstruction: Reconstruction,
+    photos: Sequence[PhotoLike] | None,
+    *,
+    max_points: int | None,
+    max_tracks: int | None,
+    voxel: float | None,
+) -> None:
+    if voxel is not None and not voxel > 0:
+        raise UserError(f"The voxel size must be positive, got {voxel}.")
+    for what, value in (("points", max_points), ("tracks", max_tracks)):
+        if value is not None and value < 1:
+            raise UserError(f"The largest number of {what} must be at least 1, got {value}.")
+    if photos is None:
+        return
+    if tuple(photo.name for photo in photos) != reconstruction.names:
+        raise UserError("The photos are not those of the reconstruction. Give the same ones, in the same order.")
+    for photo, size_hw in zip(photos, reconstruction.photo_hw.tolist(), strict=True):
+        if list(photo.size_hw) != size_hw:
+            raise UserError(f"{photo.name} has another size than when it was reconstructed. Give the same photos.")

@@ -7,6 +7,7 @@ The log, the exported files, the report and the viewer all take it from here, so
 | `keep` | (S, H, W) | bool | pixels that become points |
 | `removed_by`, `removed` | (F,) | str, int64 | filters in the order they ran, and the pixels each removed |
 | `tolerance` | () | float64 | relative depth tolerance of the multi-view filter; NaN when it did not run |
+| `masks` | (S, H, W) | bool | pixels that the user wants; absent without masks |
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from freegeo.fusion.filtering import FilterReport
 Filtered = tuple[np.ndarray, FilterReport]
 
 
-def save_kept(folder: Path, filtered: Filtered) -> Path:
-    """Write the result of `freegeo.export.formats.filter_reconstruction` and return the file's path."""
+def save_kept(folder: Path, filtered: Filtered, masks: np.ndarray | None = None) -> Path:
+    """Write the result of `freegeo.export.formats.filter_reconstruction` with these masks; returns the file's path."""
     keep, report = filtered
     arrays = {
         "keep": keep,
@@ -35,7 +36,7 @@ def save_kept(folder: Path, filtered: Filtered) -> Path:
         "removed": np.array(list(report.removed.values()), dtype=np.int64),
         "tolerance": np.float64(math.nan if report.tolerance is None else report.tolerance),
     }
-    files.write_npz(folder / KEPT_NAME, arrays)
+    files.write_npz(folder / KEPT_NAME, arrays if masks is None else {**arrays, "masks": masks})
     return folder / KEPT_NAME
 
 
@@ -58,3 +59,9 @@ def load_kept(folder: Path, shape: tuple[int, ...]) -> Filtered | None:
         raise FreeGeoError(f"{file}: belongs to another reconstruction. Remove it and run again.")
     tolerances = None if math.isnan(tolerance) else tolerance
     return keep, FilterReport(pixels=keep.size, removed=removed, tolerance=tolerances)
+
+
+def load_masks(folder: Path) -> np.ndarray | None:
+    """Read the masks (S, H, W) bool that `save_kept` wrote beside what `load_kept` reads; None when there were none."""
+    with np.load(folder / KEPT_NAME, allow_pickle=False) as content:
+        return content["masks"] if "masks" in content.files else None

@@ -109,6 +109,7 @@ def write_mesh(reconstruction: Reconstruction, keep: np.ndarray, path: Path, *, 
 
 
 def _write(export: Export) -> list[Path]:
+    export.require_pixels()
     return [write_mesh(export.reconstruction, export.keep, export.folder / FILE_NAME, voxel=export.voxel)]
 
 

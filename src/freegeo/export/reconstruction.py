@@ -29,13 +29,13 @@ import numpy as np
 
 from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.export.base import DEFAULT_FORMATS, MAX_TRACKS, Export, Format
+from freegeo.export.base import DEFAULT_FORMATS, MAX_TRACKS, Export, Exported, Format
 from freegeo.fusion.settings import MAX_POINTS, FilterSettings
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from freegeo.types import ImageBatch, Prediction
+    from freegeo.types import ImageBatch, PhotoLike, Prediction
 
 FILE_NAME = "prediction.npz"
 VERSION = 1
@@ -114,6 +114,10 @@ class Reconstruction:
             )
         return self.T_cam_world, self.K
 
+    def valid_pixels(self) -> np.ndarray:
+        """Mask (S, H, W) bool of usable depth: finite and positive."""
+        return np.isfinite(self.depth_z) & (self.depth_z > 0)
+
     def photo_K(self) -> np.ndarray:
         """Intrinsics (S, 3, 3) float64 of the original photos, pixel centres at whole numbers.
 
@@ -175,40 +179,42 @@ class Reconstruction:
         *,
         filters: FilterSettings | None = None,
         masks: list[np.ndarray] | None = None,
+        photos: Sequence[PhotoLike] | None = None,
         max_points: int | None = MAX_POINTS,
         max_tracks: int | None = MAX_TRACKS,
         voxel: float | None = None,
-        photo_folder: str = "images",
         seed: int = 0,
-    ) -> list[Path]:
-        """Write files for other tools and return their paths.
+    ) -> Exported:
+        """Write files for other tools, and return which, and which formats could not be written.
+
+        A format that has nothing to write is a warning, and the others are written nevertheless. Files of the same
+        formats that an earlier export left in the folder are replaced or removed.
 
         Args:
             folder: where they are written.
-            formats: names of `freegeo.export.formats.FORMATS`, or all.
+            formats: names of `freegeo.export.formats.FORMATS`; `all` stands for all that can be written.
             filters: which points are kept; None: the defaults of `FilterSettings`.
             masks: one (H, W) array per photo at its size, not zero where points are wanted.
+            photos: the photos of this reconstruction, of which `colmap` and `nerfstudio` write upright copies.
             max_points: of `points.ply` and `scene.glb`; None writes all.
             max_tracks: points of the COLMAP model; None writes all.
             voxel: voxel edge of the mesh in the reconstruction's units; None: from its resolution.
-            photo_folder: where nerfstudio finds the original photos, relative to `folder`.
             seed: of the random choice of points.
 
         Raises:
-            UserError: an unknown format, a missing extra, or formats with 3D points without cameras.
-            FreeGeoError: nothing is left to write.
+            UserError: a format that is unknown or can never be written: a missing extra, no cameras, one photo.
+            FreeGeoError: nothing at all is left to write.
         """
-        from freegeo.export.formats import export, filter_reconstruction
+        from freegeo.export.formats import check_formats, export, filter_reconstruction
         from freegeo.export.pixels import masks_for_model
 
-        filtered = None
-        if self.has_cameras and (filters is not None or masks is not None):
-            wanted = None if masks is None else masks_for_model(self, masks)
-            filtered = filter_reconstruction(self, masks=wanted, settings=filters)
+        names = check_formats(formats, self.names, has_cameras=self.has_cameras)
+        wanted = None if masks is None else masks_for_model(self, masks)
+        filtered = filter_reconstruction(self, masks=wanted, settings=filters) if self.has_cameras else None
         return export(
-            self, Path(folder).expanduser(), formats, filtered=filtered, max_points=max_points, max_tracks=max_tracks,
-            voxel=voxel, photo_folder=photo_folder, seed=seed,
-        )  # fmt: skip
+            self, Path(folder).expanduser(), names, filtered=filtered, masks=wanted, photos=photos,
+            max_points=max_points, max_tracks=max_tracks, voxel=voxel, seed=seed,
+        ).require_any()  # fmt: skip
 
     @classmethod
     def load(cls, path: Path | str) -> Reconstruction:
