@@ -174,17 +174,28 @@ def test_a_format_that_fails_costs_neither_the_report_nor_the_others(
     assert "Format ply is not written" in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_export_is_partial_too_and_fails_when_nothing_is_written(freegeo, out, monkeypatch):
+def test_export_is_partial_too_and_fails_when_nothing_is_written(freegeo, out, tmp_path, monkeypatch):
+    other = tmp_path / "other"
+    assert freegeo("export", out, "-f", "ply", "-o", other).code == 0
+    assert (other / "points.ply").exists()
     strict = FilterSettings(min_agreeing=50, min_asked=0)
     monkeypatch.setattr("freegeo.cli.files.FilterOptions.settings", lambda self: strict)
-    outcome = freegeo("export", out, "-f", "ply", "depth", "--min-agreeing", 50)
+    outcome = freegeo("export", out, "-f", "ply", "depth", "--min-agreeing", 50, "-o", other)
     assert outcome.code == 3
     assert "ply not written" in outcome.sentence()
-    assert str(out / "depth" / "0.png") in outcome.out
-    assert not (out / "points.ply").exists(), "the points of other filters are gone"
-    outcome = freegeo("export", out, "-f", "ply", "--min-agreeing", 50)
+    assert str(other / "depth" / "0.png") in outcome.out
+    assert not (other / "points.ply").exists(), "the points of other filters are gone"
+    outcome = freegeo("export", out, "-f", "ply", "--min-agreeing", 50, "-o", other)
     assert outcome.code == 1
     assert "nothing was written" in outcome.sentence()
+
+
+def test_files_beside_a_report_show_its_points(freegeo, out):
+    before = (out / "points.ply").read_bytes()
+    outcome = freegeo("export", out, "-f", "ply", "--drop-share", 0.9)
+    assert outcome.code == 2
+    assert "show other points than these options keep" in outcome.sentence() and "--output" in outcome.sentence()
+    assert (out / "points.ply").read_bytes() == before
 
 
 def test_a_model_without_cameras_writes_what_needs_none(freegeo, photo_folder, tiny, tmp_path, monkeypatch):
