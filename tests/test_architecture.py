@@ -9,11 +9,14 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "src" / "freegeo"
 ANYWHERE = {"types", "errors", "files", "run_folder", "__init__"}
 ALLOWED = {
-    "pipeline": {"models", "data", "adaptation", "fusion", "export", "report", "metrics", "geometry", "progress"},
+    "pipeline": {
+        "models", "data", "adaptation", "evidence", "fusion", "export", "report", "metrics", "geometry", "progress",
+    },  # fmt: skip
     "progress": {"adaptation"},
     "benchmark": {"adaptation", "models", "data", "fusion", "metrics", "geometry"},
     "training": {"models", "data", "metrics", "geometry"},
     "adaptation": {"models", "data.scene", "geometry"},
+    "evidence": {"export", "fusion", "metrics", "geometry"},
     "report": {"export", "metrics", "geometry"},
     "export": {"fusion", "geometry"},
     "fusion": {"geometry"},

@@ -1,0 +1,315 @@
+"""Scores of cameras and depth against verified matches, without ground truth (docs/evidence.md, "Scores").
+
+All of them are per pair of views; errors are in matching pixels (`Matches.match_hw`). World frame and scale of a
+candidate do not matter. A pair of nan has no evidence; a score without any pair is nan and says why.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from freegeo.evidence.candidate import Candidate
+from freegeo.evidence.matches import Matches, MatchSettings, magsac
+from freegeo.geometry.camera import project
+from freegeo.geometry.depth import valid_depth
+from freegeo.geometry.rotation import rotation_angle
+from freegeo.geometry.se3 import inverse, relative, transform_points
+from freegeo.metrics.pose import area_under_curve
+
+__all__ = [
+    "DepthScale",
+    "PairAngles",
+    "PairScores",
+    "depth_scale",
+    "epipolar",
+    "off_edges",
+    "reprojection",
+    "two_view",
+]
+
+EDGE = 0.05
+"""Relative range of depth in 3 x 3 pixels from which a place counts as a depth edge."""
+BEHIND = 8.0
+"""A point behind a camera counts as so many times the median error."""
+FEWEST = 6
+"""A pair with fewer usable matches has no evidence."""
+FACTORS = (0.90, 1.10)
+"""Range of the depth factor of `depth_scale`."""
+_NO_DEPTH = "No pair of views has enough matches on smooth surfaces of known depth."
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PairScores:
+    """One error for each pair of views with matches."""
+
+    pairs: np.ndarray
+    """(P, 2) int64 views."""
+    values: np.ndarray
+    """(P,) float64 matching pixels, lower is better; nan where the pair has no evidence."""
+    used: np.ndarray
+    """(P,) int64 matches that were used."""
+    reason: str | None
+    """Why no pair has a value; None when one has."""
+
+    @property
+    def mean(self) -> float:
+        """Mean over the pairs that have a value, unclipped; nan without any."""
+        known = self.values[~np.isnan(self.values)]
+        return float(known.mean()) if len(known) else float("nan")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PairAngles:
+    """Angles between each pair's relative pose as its matches give it and as a candidate has it."""
+
+    pairs: np.ndarray
+    """(P, 2) int64 views."""
+    rotation_deg: np.ndarray
+    """(P,) 0 to 180; nan where the matches give no pose."""
+    translation_deg: np.ndarray
+    """(P,) angle between the baselines up to sign, 0 to 90; nan where the matches give no pose."""
+    reason: str | None
+    """Why no pair has a value; None when one has."""
+
+    def area(self, threshold_deg: int = 30) -> float:
+        """Area under the recall curve of the larger angle, 0 to 1, higher is better; nan without a pair."""
+        worst = np.maximum(self.rotation_deg, self.translation_deg)
+        return float(area_under_curve(torch.from_numpy(worst[~np.isnan(worst)]), threshold_deg))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthScale:
+    """By how much all depths disagree with the scale of the camera positions."""
+
+    factor: float
+    """Depth factor with the least reprojection error, within `FACTORS`; nan without evidence."""
+    error_px: float
+    """`reprojection(...).mean` with this factor."""
+    reason: str | None
+
+    @property
+    def drift(self) -> float:
+        """Distance of the factor from 1."""
+        return abs(self.factor - 1)
+
+
+def epipolar(candidate: Candidate, matches: Matches) -> PairScores:
+    """S1: median Sampson distance of each pair's matches from the candidate's epipolar lines.
+
+    It sees errors of poses and focal lengths, and nothing of depth. Two cameras in one place have no epipolar lines;
+    they map the first photo onto the second by a homography, and the match's first-order distance from that counts.
+    """
+    first, second, x, y, K, T = _two_sides(candidate, matches)
+    R, t = T[:, :3, :3], T[:, :3, 3]
+    infinite = K[second] @ R @ torch.linalg.inv(K[first])
+    mapped = _rows(infinite, _homogeneous(x))
+    epipole = _rows(K[second], t)
+    line = torch.linalg.cross(epipole, mapped)
+    back = _rows(infinite.mT, torch.linalg.cross(_homogeneous(y), epipole))
+    steep = torch.sqrt(line[:, :2].square().sum(-1) + back[:, :2].square().sum(-1))
+    distance = (line * _homogeneous(y)).sum(-1).abs() / steep
+    transfer = torch.linalg.vector_norm(mapped[:, :2] / mapped[:, 2:] - y, dim=-1) / 2**0.5
+    distance = torch.where((t == 0).all(-1), transfer, distance)
+    return _medians(matches, distance.numpy(), matches.reason())
+
+
+def two_view(candidate: Candidate, matches: Matches, *, settings: MatchSettings | None = None) -> PairAngles:
+    """S1b: angles between the candidate's relative poses and those of essential matrices fitted to the matches.
+
+    Only the candidate's intrinsics enter the fit (MAGSAC++, then the one of four poses with the points in front). Noisy
+    for a single pair, in the translation above all where the baseline is short or the scene flat; good on average.
+    """
+    import cv2
+
+    settings = settings or MatchSettings()
+    first, second, x, y, K, T = (value.numpy() for value in _two_sides(candidate, matches))
+    fitted = np.full((len(matches.pairs), 4, 4), np.nan)
+    starts = matches.pair_start
+    for pair, (low, high) in enumerate(pairwise(starts)):
+        i, j = first[low], second[low]
+        try:
+            essential, mask = cv2.findEssentialMat(
+                x[low:high], y[low:high], K[i], K[j], None, None, magsac(settings, settings.threshold_px)
+            )
+            if essential is None or essential.shape != (3, 3):
+                continue
+            ends = [_normalised(pixel[low:high], K[view]) for pixel, view in ((x, i), (y, j))]
+            in_front, R, t, _ = cv2.recoverPose(essential, *ends, np.eye(3), mask=mask)
+        except cv2.error:
+            continue
+        if in_front >= FEWEST:
+            fitted[pair, :3, :3], fitted[pair, :3, 3] = R, t[:, 0]
+    own = T[starts[:-1]] if len(T) else np.zeros((0, 4, 4))
+    rotation = torch.rad2deg(rotation_angle(*(torch.from_numpy(m[:, :3, :3]) for m in (own, fitted)))).numpy()
+    with np.errstate(invalid="ignore"):
+        length = np.linalg.norm(own[:, :3, 3], axis=1)
+        cosine = np.abs((own[:, :3, 3] * fitted[:, :3, 3]).sum(axis=1)) / np.where(length == 0, np.inf, length)
+        translation = np.rad2deg(np.arccos(np.clip(cosine, 0, 1)))
+    none = "The matches of no pair of views give a relative pose."
+    reason = matches.reason() or (none if np.isnan(rotation).all() else None)
+    return PairAngles(pairs=matches.pairs, rotation_deg=rotation, translation_deg=translation, reason=reason)
+
+
+def off_edges(candidate: Candidate, matches: Matches) -> np.ndarray:
+    """Which match ends (M, 2) lie on smooth, known depth: no range above 5 % in the 3 x 3 pixels around them."""
+    return _lifted(candidate, matches)[1].numpy()
+
+
+def reprojection(
+    candidate: Candidate, matches: Matches, *, keep: np.ndarray | None = None, factor: float = 1.0
+) -> PairScores:
+    """S2: median distance of matches from where the candidate's depth and cameras put them, both directions together.
+
+    Points behind the other camera count as `BEHIND` times the median of the others of their pair.
+
+    Args:
+        candidate: cameras and depth.
+        matches: of the same photos.
+        keep: (M, 2) bool, match ends whose depth is used, so that candidates are compared on the same ones; None: those
+            of this candidate (`off_edges`). Ends without known depth in this candidate are left out in any case.
+        factor: all depths are multiplied by it.
+    """
+    z, smooth = _lifted(candidate, matches)
+    usable = smooth if keep is None else torch.from_numpy(keep) & ~z.isnan()
+    return _reprojection(candidate, matches, z * factor, usable)
+
+
+def depth_scale(candidate: Candidate, matches: Matches, *, keep: np.ndarray | None = None) -> DepthScale:
+    """S2g: the factor on all depths that makes `reprojection` least; arguments as there.
+
+    Depth and poses of a network can drift apart in scale while each of them looks better.
+    """
+    z, smooth = _lifted(candidate, matches)
+    usable = smooth if keep is None else torch.from_numpy(keep) & ~z.isnan()
+
+    def error(factor: float) -> float:
+        return _reprojection(candidate, matches, z * factor, usable).mean
+
+    start = error(1.0)
+    if np.isnan(start):
+        return DepthScale(factor=float("nan"), error_px=float("nan"), reason=matches.reason() or _NO_DEPTH)
+    best, step = (start, 1.0), 0.02
+    while step >= 0.0005:
+        tried = [best[1] + k * step for k in ((-5, -4, -3, -2, -1, 1, 2, 3, 4, 5) if step == 0.02 else (-2, -1, 1, 2))]
+        inside = [round(f, 6) for f in tried if FACTORS[0] - 1e-9 <= f <= FACTORS[1] + 1e-9]
+        best = min([best, *((error(f), f) for f in inside)])
+        step /= 3
+    return DepthScale(factor=best[1], error_px=best[0], reason=None)
+
+
+def _two_sides(candidate: Candidate, matches: Matches) -> tuple[Tensor, ...]:
+    """First and second view (M,), pixels (M, 2), intrinsics (S, 3, 3) at matching size, relative poses (M, 4, 4)."""
+    _same_views(candidate, matches)
+    first, second = torch.from_numpy(matches.pairs[matches.pair_of]).T
+    x, y = torch.from_numpy(matches.in_matching_pixels()[matches.ends]).unbind(1)
+    K = candidate.matching_K(*map(torch.from_numpy, (matches.photo_hw, matches.match_hw)))
+    return first, second, x, y, K, relative(candidate.T_cam_world[first], candidate.T_cam_world[second])
+
+
+def _same_views(candidate: Candidate, matches: Matches) -> None:
+    if len(candidate) != len(matches):
+        raise ValueError(f"a candidate of {len(candidate)} views and matches of {len(matches)} photos")
+
+
+def _lifted(candidate: Candidate, matches: Matches) -> tuple[Tensor, Tensor]:
+    """Depth (M, 2) at both ends of every match, nan where unknown, and where it is known and smooth (M, 2)."""
+    _same_views(candidate, matches)
+    view = torch.from_numpy(matches.view_of)
+    pixel = candidate.in_model(view, torch.from_numpy(matches.keypoints))
+    depth = candidate.depth_z.detach().cpu().double()
+    depth = torch.where(valid_depth(depth), depth, torch.nan)
+    ends = torch.from_numpy(matches.ends)
+    z, smooth = depth_at(depth, view, pixel)
+    return z[ends], smooth[ends]
+
+
+def depth_at(depth_z: Tensor, view: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
+    """Depth (n,) at places (n, 2) of views (n,), and whether it is known and off depth edges.
+
+    Inverse depth is interpolated, because it is linear on planes; unknown depth (nan) next to the place, or a place
+    outside the map (S, H, W), gives nan.
+    """
+    height, width = depth_z.shape[1:]
+    u, v = pixel.unbind(-1)
+    inside = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
+    u, v = (torch.where(inside, value, 0.0) for value in (u, v))
+    column, row = u.floor().long().clamp(0, max(width - 2, 0)), v.floor().long().clamp(0, max(height - 2, 0))
+    right, below = min(1, width - 1), min(1, height - 1)
+    a, b = (u - column).clamp(0, 1), (v - row).clamp(0, 1)
+    corners = (1 / depth_z[view, row + below * y, column + right * x] for y in (0, 1) for x in (0, 1))
+    one, two, three, four = corners
+    z = 1 / ((1 - b) * ((1 - a) * one + a * two) + b * ((1 - a) * three + a * four))
+    z = torch.where(inside, z, torch.nan)
+    around = _neighbourhood(depth_z, view, pixel.round().long())
+    smooth = around.amax(-1) <= (1 + EDGE) * around.amin(-1)  # false for nan
+    return z, smooth & ~z.isnan()
+
+
+def _neighbourhood(depth_z: Tensor, view: Tensor, pixel: Tensor) -> Tensor:
+    """The 3 x 3 depths (n, 9) around pixels (n, 2); the border is repeated."""
+    height, width = depth_z.shape[1:]
+    shifts = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+    return torch.stack(
+        [
+            depth_z[view, (pixel[:, 1] + y).clamp(0, height - 1), (pixel[:, 0] + x).clamp(0, width - 1)]
+            for x, y in shifts
+        ],
+        dim=-1,
+    )
+
+
+def _reprojection(candidate: Candidate, matches: Matches, z: Tensor, usable: Tensor) -> PairScores:
+    first, second, x, y, K, T = _two_sides(candidate, matches)
+    errors = torch.stack(
+        (
+            _landing(x, z[:, 0], K[first], T, K[second], y),
+            _landing(y, z[:, 1], K[second], inverse(T), K[first], x),
+        ),
+        dim=1,
+    )
+    errors = torch.where(usable, errors, torch.nan).numpy()
+    return _medians(matches, errors, matches.reason() or _NO_DEPTH)
+
+
+def _landing(x: Tensor, z: Tensor, K_x: Tensor, T: Tensor, K_y: Tensor, y: Tensor) -> Tensor:
+    """Distance (n,) between pixels y and where pixels x with depth z appear; inf behind the camera."""
+    there = transform_points(T, _rows(torch.linalg.inv(K_x), _homogeneous(x)) * z[:, None])
+    distance = torch.linalg.vector_norm(project(there, K_y) - y, dim=-1)
+    return torch.where(there[:, 2] > 0, distance, torch.inf)
+
+
+def _medians(matches: Matches, errors: np.ndarray, reason: str | None) -> PairScores:
+    """Median of each pair's errors (M, ...); nan is left out, inf (behind a camera) counts as a large error."""
+    values = np.full(len(matches.pairs), np.nan)
+    used = np.zeros(len(matches.pairs), dtype=np.int64)
+    for pair, (low, high) in enumerate(pairwise(matches.pair_start)):
+        known = errors[low:high][~np.isnan(errors[low:high])]
+        used[pair] = len(known)
+        if len(known) < FEWEST:
+            continue
+        behind = np.isinf(known)
+        # A pair with every point behind a camera has no median to count by.
+        values[pair] = (
+            np.inf if behind.all() else np.median(np.where(behind, BEHIND * np.median(known[~behind]), known))
+        )
+    return PairScores(pairs=matches.pairs, values=values, used=used, reason=reason if np.isnan(values).all() else None)
+
+
+def _homogeneous(pixel: Tensor) -> Tensor:
+    return torch.cat((pixel, torch.ones_like(pixel[:, :1])), dim=-1)
+
+
+def _rows(matrix: Tensor, vectors: Tensor) -> Tensor:
+    """Multiply vectors (n, 3) by matrices (n, 3, 3), one each."""
+    return (matrix @ vectors[..., None])[..., 0]
+
+
+def _normalised(pixel: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Image-plane coordinates (n, 2) of pixels (n, 2)."""
+    rays = np.linalg.solve(K, np.vstack((pixel.T, np.ones(len(pixel)))))
+    return np.ascontiguousarray((rays[:2] / rays[2]).T)
