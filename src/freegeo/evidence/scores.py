@@ -62,6 +62,12 @@ class PairScores:
         known = self.values[~np.isnan(self.values)]
         return float(known.mean()) if len(known) else float("nan")
 
+    @property
+    def median(self) -> float:
+        """Median over the pairs that have a value, which a few wrongly verified pairs do not move; nan without any."""
+        known = self.values[~np.isnan(self.values)]
+        return float(np.median(known)) if len(known) else float("nan")
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairAngles:

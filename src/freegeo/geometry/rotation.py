@@ -4,6 +4,8 @@ The order of a quaternion's numbers is part of every name: ``quat_xyzw`` (scalar
 ``quat_wxyz`` (scalar first; COLMAP). ``q`` and ``-q`` are the same rotation.
 """
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -101,7 +103,7 @@ def rotate(matrix: Tensor, vectors: Tensor) -> Tensor:
     (S, H, W, 3) map, and a single (3, 3) matrix turns anything.
     """
     leading = matrix.ndim - 2
-    flat = vectors.reshape(*vectors.shape[:leading], -1, 3)
+    flat = vectors.reshape(*vectors.shape[:leading], math.prod(vectors.shape[leading:-1]), 3)
     return (flat @ matrix.mT).reshape(
         *torch.broadcast_shapes(vectors.shape[:leading], matrix.shape[:-2]), *vectors.shape[leading:]
     )
