@@ -69,6 +69,12 @@ def test_one_matrix_turns_a_whole_map():
     assert torch.allclose(rotation.rotate(matrix[0], vectors[0]), expected[0], atol=1e-5)
 
 
+def test_no_vectors_are_turned_into_none():
+    assert rotation.rotate(torch.zeros(0, 3, 3), torch.zeros(0, 3)).shape == (0, 3)
+    assert rotation.rotate(torch.eye(3), torch.zeros(0, 3)).shape == (0, 3)
+    assert rotation.rotate(torch.zeros(2, 3, 3), torch.zeros(2, 0, 3)).shape == (2, 0, 3)
+
+
 @given(axis=axes, angle=angles, spread=st.floats(0, 1))
 @settings(max_examples=50, deadline=None)
 def test_mean_of_turns_to_both_sides_is_the_middle(axis, angle, spread):

@@ -72,7 +72,7 @@ class MatchSettings:
 
     longest_side: int = 1024
     """Photos are shrunk to this many pixels; smaller ones stay as they are."""
-    ratio: float = 0.8
+    ratio: float = 0.85
     """Largest distance of a match as a share of the second best, in both directions."""
     threshold_px: float = 1.0
     """Largest distance from the epipolar line, matching pixels."""
