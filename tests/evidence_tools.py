@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from exact_rooms import room
 
+from exact_rooms import room
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.dense import co_visible
 from freegeo.evidence.matches import Matches, Outcome
@@ -28,8 +28,8 @@ def exact_matches(scene: Candidate, noise_px: float = 0.0, each: int = 40) -> Ma
     seen = co_visible(scene)
     photo_hw = np.rint(np.array([[height, width]]) / scene.scale_xy.numpy()[:, ::-1]).astype(np.int64)
     keypoints, ends, pairs = [[] for _ in range(views)], [], []
-    for d, (i, j) in enumerate(seen.pairs.tolist()):
-        pixels = seen.pixel[seen.pair == d].numpy()
+    for i, j in seen.pairs.tolist():
+        pixels = seen.pixel[seen.seen[i, j]].numpy()
         if i > j or len(pixels) < each:
             continue
         chosen = torch.from_numpy(generator.choice(pixels, each, replace=False))

@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from evidence_tools import VIEWS, moved_world, truth, turned
 
+from evidence_tools import VIEWS, moved_world, truth, turned
 from freegeo.evidence.dense import (
     LARGEST_LOG,
     camera_difference,
@@ -90,8 +90,9 @@ def test_the_mask_limits_the_set():
     usable = torch.zeros_like(scene().depth_z, dtype=torch.bool)
     usable[:, :, :48] = True
     limited = co_visible(scene(), usable)
-    assert 0 < len(limited.pixel) < len(fixed().pixel)
-    assert (limited.pixel % scene().depth_z.shape[2] < 48).all()
+    assert limited.seen.any()
+    assert not limited.seen[..., limited.pixel % scene().depth_z.shape[2] >= 48].any()
+    assert (limited.share <= 1).all()
 
 
 def test_nothing_in_common_is_said():

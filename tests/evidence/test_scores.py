@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from evidence_tools import exact_matches, moved_world, truth, turned, without_matches
 
+from evidence_tools import exact_matches, moved_world, truth, turned, without_matches
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.matches import Matches, Outcome
 from freegeo.evidence.scores import depth_scale, epipolar, off_edges, reprojection, two_view

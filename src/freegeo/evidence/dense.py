@@ -15,9 +15,8 @@ from torch import Tensor
 
 from freegeo.evidence.candidate import Candidate
 from freegeo.fusion.agreement import relative_slope, tolerance_of
-from freegeo.geometry.camera import project
 from freegeo.geometry.depth import depth_to_world, valid_depth
-from freegeo.geometry.se3 import relative, transform_points
+from freegeo.geometry.se3 import relative
 from freegeo.metrics.pose import area_under_curve, pair_errors
 
 __all__ = [
@@ -31,7 +30,7 @@ __all__ = [
     "stability",
 ]
 
-SAMPLES = 4096
+SAMPLES = 2048
 """Most pixels of a view that take part, on an even grid."""
 LARGEST_LOG = float(np.log(2))
 """A pixel that misses the other view, or differs by more than a factor of two, counts as a factor of two."""
@@ -42,16 +41,19 @@ _NOTHING_SHARED = "No two views see the same surface."
 class CoVisible:
     """Pixels that another view sees too, by one prediction: the fixed set on which candidates are compared."""
 
-    pairs: np.ndarray
-    """(D, 2) int64 source and target views, in both directions."""
-    pair: Tensor
-    """(n,) int64 the directed pair of each pixel, sorted."""
     pixel: Tensor
-    """(n,) int64 flat index into the source's depth map."""
+    """(G,) int64 flat indices into a depth map, the same for all views."""
+    seen: Tensor
+    """(S, S, G) bool: whether the second view sees what the first has there; false for a view and itself."""
     share: np.ndarray
     """(S, S) share of each view's known pixels that the other view sees, for `choose_pairs`."""
     tolerance: float
     """Relative depth difference that counts as the same surface."""
+
+    @property
+    def pairs(self) -> np.ndarray:
+        """(D, 2) int64 source and target views with a pixel in common, sorted."""
+        return torch.nonzero(self.seen.any(-1)).cpu().numpy()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,32 +105,22 @@ def co_visible(candidate: Candidate, usable: Tensor | None = None) -> CoVisible:
     """
     depth = candidate.depth_z
     known = valid_depth(depth) if usable is None else valid_depth(depth) & usable.to(depth.device)
-    views, height, width = depth.shape
+    height, width = depth.shape[1:]
     step = max(1, int(np.ceil(np.sqrt(height * width / SAMPLES))))
-    grid = torch.arange(height * width, device=depth.device).view(height, width)[step // 2 :: step, step // 2 :: step]
-    grid = grid.flatten()
-    T, K = _cameras(candidate)
-    tolerance = tolerance_of(depth, T, K, known)
-    pairs, pair, pixels = [], [], []
-    share = np.zeros((views, views))
-    for source in range(views):
-        chosen = grid[known[source].flatten()[grid]]
-        for target in range(views):
-            if target == source or not len(chosen):
-                continue
-            expected, measured = _meet(candidate, source, target, chosen)
-            seen = chosen[expected <= measured * (1 + tolerance)]  # false for nan
-            share[source, target] = len(seen) / len(chosen)
-            if len(seen):
-                pair.append(torch.full_like(seen, len(pairs)))
-                pixels.append(seen)
-                pairs.append((source, target))
-    empty = grid.new_zeros(0)
+    grid = torch.arange(height * width, device=depth.device).view(height, width)
+    grid = grid[step // 2 :: step, step // 2 :: step].flatten()
+    tolerance = tolerance_of(depth, *_cameras(candidate), known)
+    seen = []
+    for source in range(len(depth)):
+        expected, measured, _ = _meet(candidate, source, grid)
+        seen.append((expected <= measured * (1 + tolerance)) & known[source].flatten()[grid])  # false for nan
+        seen[-1][source] = False
+    everything = torch.stack(seen) if seen else depth.new_zeros((0, 0, len(grid)), dtype=torch.bool)
+    possible = known.flatten(1)[:, grid].sum(-1).clamp(min=1)
     return CoVisible(
-        pairs=np.array(pairs, dtype=np.int64).reshape(-1, 2),
-        pair=torch.cat([empty, *pair]),
-        pixel=torch.cat([empty, *pixels]),
-        share=share,
+        pixel=grid,
+        seen=everything,
+        share=(everything.sum(-1) / possible[:, None]).double().cpu().numpy(),
         tolerance=tolerance,
     )
 
@@ -141,19 +133,20 @@ def depth_agreement(candidate: Candidate, fixed: CoVisible) -> DepthAgreement:
     """
     depth = candidate.depth_z
     slope = relative_slope(torch.where(valid_depth(depth), depth, torch.nan)).flatten(1)
-    share, log_ratio = np.full(len(fixed.pairs), np.nan), np.full(len(fixed.pairs), np.nan)
-    counts = torch.bincount(fixed.pair, minlength=len(fixed.pairs)).tolist()
-    results = []
-    for (source, target), pixels in zip(fixed.pairs.tolist(), fixed.pixel.split(counts), strict=True):
-        expected, measured, landed = _meet(candidate, source, target, pixels, with_landing=True)
+    pairs = fixed.pairs
+    share, log_ratio = [], []
+    for source in range(len(depth)):
+        expected, measured, landed = _meet(candidate, source, fixed.pixel)
+        seen = fixed.seen[source]
         log = (measured / expected).log().abs()
-        confirmed = log <= (fixed.tolerance + slope[target][landed])  # false for nan
+        confirmed = log <= fixed.tolerance + slope.gather(1, landed)  # false for nan
         clipped = log.nan_to_num(LARGEST_LOG).clamp(max=LARGEST_LOG)
-        results.append(torch.stack((confirmed.to(clipped).mean(), clipped.mean())))
-    if results:
-        share, log_ratio = torch.stack(results).double().cpu().numpy().T
+        count = seen.sum(-1)
+        share.append((confirmed & seen).sum(-1) / count)
+        log_ratio.append((clipped * seen).sum(-1) / count)
+    values = torch.stack((torch.stack(share), torch.stack(log_ratio))).double().cpu().numpy()[:, *pairs.T]
     return DepthAgreement(
-        pairs=fixed.pairs, share=share, log_ratio=log_ratio, reason=None if len(fixed.pairs) else _NOTHING_SHARED
+        pairs=pairs, share=values[0], log_ratio=values[1], reason=None if len(pairs) else _NOTHING_SHARED
     )
 
 
@@ -225,25 +218,27 @@ def _cameras(candidate: Candidate) -> tuple[Tensor, Tensor]:
     return candidate.T_cam_world.to(candidate.depth_z), candidate.K.to(candidate.depth_z)
 
 
-def _meet(candidate: Candidate, source: int, target: int, pixels: Tensor, *, with_landing: bool = False):
-    """Depth (n,) that the target should measure at the points of source pixels (n,), and that it has there.
+def _meet(candidate: Candidate, source: int, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Depth (S, n) that every view should measure at the points of source pixels (n,), what it has there, and where.
 
-    The measured depth is nan where the point misses the image, lies behind the camera, or has no depth.
+    The measured depth is nan where the point misses the image, lies behind the camera, or has no depth on either side;
+    the place is a flat index into the view's map, meaningless there.
     """
     depth = candidate.depth_z
     height, width = depth.shape[1:]
     # Relative poses in double precision: a world frame far from the cameras costs no digits.
-    T = relative(candidate.T_cam_world[source], candidate.T_cam_world[target]).to(depth)
-    K_inverse, K = torch.linalg.inv(candidate.K[source]).to(depth), candidate.K[target].to(depth)
-    place = torch.stack((pixels % width, pixels // width, torch.ones_like(pixels)), dim=-1).to(depth)
-    points = transform_points(T, place @ K_inverse.mT * depth[source].flatten()[pixels][:, None])
-    there, expected = project(points, K), points[:, 2]
-    column, row = (there + 0.5).floor().nan_to_num(-1.0).unbind(-1)
+    T = relative(candidate.T_cam_world[source], candidate.T_cam_world)
+    # From the source's pixels, times depth, to those of every view, in one product.
+    to_pixels = (candidate.K @ T[:, :3, :3] @ torch.linalg.inv(candidate.K[source])).to(depth)
+    shift = (candidate.K @ T[:, :3, 3:]).to(depth)
+    place = torch.stack((pixels % width, pixels // width, torch.ones_like(pixels))).to(depth)
+    own = depth[source].flatten()[pixels]
+    x, y, expected = (to_pixels @ (place * torch.where(valid_depth(own), own, torch.nan)) + shift).unbind(1)
+    column, row = (x / expected + 0.5).floor(), (y / expected + 0.5).floor()
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & valid_depth(expected)
-    landed = torch.where(inside, row.clamp(0, height - 1) * width + column.clamp(0, width - 1), 0.0).long()
-    measured = depth[target].flatten()[landed]
-    measured = torch.where(inside & valid_depth(measured), measured, torch.nan)
-    return (expected, measured, landed) if with_landing else (expected, measured)
+    landed = torch.where(inside, row * width + column, 0.0).long()
+    measured = depth.flatten(1).gather(1, landed)
+    return expected, torch.where(inside & valid_depth(measured), measured, torch.nan), landed
 
 
 def _mean(values: np.ndarray) -> float:

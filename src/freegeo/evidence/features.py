@@ -40,8 +40,8 @@ class RootSift:
     most: int = 2000
     """Keypoints kept, those of highest contrast."""
     contrast: float = 0.005
-    """Least contrast of a keypoint, OpenCV's `contrastThreshold`. Far below its usual 0.04: plain walls and small photos
-    then have several times the matches, no less exact ones (docs/evidence.md, "Matches")."""
+    """Least contrast of a keypoint, OpenCV's `contrastThreshold`. Far below its usual 0.04: plain walls and small
+    photos then have several times the matches, no less exact ones (docs/evidence.md, "Matches")."""
 
     @property
     def name(self) -> str:

@@ -15,10 +15,9 @@ from torch import Tensor
 
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.matches import Matches, MatchSettings, magsac
-from freegeo.geometry.camera import project
 from freegeo.geometry.depth import valid_depth
 from freegeo.geometry.rotation import rotation_angle
-from freegeo.geometry.se3 import inverse, relative, transform_points
+from freegeo.geometry.se3 import inverse, relative
 from freegeo.metrics.pose import area_under_curve
 
 __all__ = [
@@ -38,6 +37,8 @@ BEHIND = 8.0
 """A point behind a camera counts as so many times the median error."""
 FEWEST = 6
 """A pair with fewer usable matches has no evidence."""
+MOST_FITTED = 300
+"""With twice as many matches or more, `two_view` fits every second, third, ... of them."""
 FACTORS = (0.90, 1.10)
 """Range of the depth factor of `depth_scale`."""
 _NO_DEPTH = "No pair of views has enough matches on smooth surfaces of known depth."
@@ -59,8 +60,7 @@ class PairScores:
     @property
     def mean(self) -> float:
         """Mean over the pairs that have a value, unclipped; nan without any."""
-        known = self.values[~np.isnan(self.values)]
-        return float(known.mean()) if len(known) else float("nan")
+        return _mean(self.values)
 
     @property
     def median(self) -> float:
@@ -121,7 +121,8 @@ def epipolar(candidate: Candidate, matches: Matches) -> PairScores:
     distance = (line * _homogeneous(y)).sum(-1).abs() / steep
     transfer = torch.linalg.vector_norm(mapped[:, :2] / mapped[:, 2:] - y, dim=-1) / 2**0.5
     distance = torch.where((t == 0).all(-1), transfer, distance)
-    return _medians(matches, distance.numpy(), matches.reason())
+    values, used = _medians(distance.numpy(), matches.pair_of, len(matches.pairs))
+    return _pair_scores(matches, values, used, None)
 
 
 def two_view(candidate: Candidate, matches: Matches, *, settings: MatchSettings | None = None) -> PairAngles:
@@ -138,13 +139,14 @@ def two_view(candidate: Candidate, matches: Matches, *, settings: MatchSettings 
     starts = matches.pair_start
     for pair, (low, high) in enumerate(pairwise(starts)):
         i, j = first[low], second[low]
+        chosen = slice(low, high, max(1, (high - low) // MOST_FITTED))
         try:
             essential, mask = cv2.findEssentialMat(
-                x[low:high], y[low:high], K[i], K[j], None, None, magsac(settings, settings.threshold_px)
+                x[chosen], y[chosen], K[i], K[j], None, None, magsac(settings, settings.threshold_px)
             )
             if essential is None or essential.shape != (3, 3):
                 continue
-            ends = [_normalised(pixel[low:high], K[view]) for pixel, view in ((x, i), (y, j))]
+            ends = [_normalised(pixel[chosen], K[view]) for pixel, view in ((x, i), (y, j))]
             in_front, R, t, _ = cv2.recoverPose(essential, *ends, np.eye(3), mask=mask)
         except cv2.error:
             continue
@@ -180,9 +182,8 @@ def reprojection(
             of this candidate (`off_edges`). Ends without known depth in this candidate are left out in any case.
         factor: all depths are multiplied by it.
     """
-    z, smooth = _lifted(candidate, matches)
-    usable = smooth if keep is None else torch.from_numpy(keep) & ~z.isnan()
-    return _reprojection(candidate, matches, z * factor, usable)
+    values, used = _medians(*_carried(candidate, matches, keep).errors(factor), len(matches.pairs))
+    return _pair_scores(matches, values, used, _NO_DEPTH)
 
 
 def depth_scale(candidate: Candidate, matches: Matches, *, keep: np.ndarray | None = None) -> DepthScale:
@@ -190,11 +191,10 @@ def depth_scale(candidate: Candidate, matches: Matches, *, keep: np.ndarray | No
 
     Depth and poses of a network can drift apart in scale while each of them looks better.
     """
-    z, smooth = _lifted(candidate, matches)
-    usable = smooth if keep is None else torch.from_numpy(keep) & ~z.isnan()
+    carried = _carried(candidate, matches, keep)
 
     def error(factor: float) -> float:
-        return _reprojection(candidate, matches, z * factor, usable).mean
+        return _mean(_medians(*carried.errors(factor), len(matches.pairs))[0])
 
     start = error(1.0)
     if np.isnan(start):
@@ -269,41 +269,78 @@ def _neighbourhood(depth_z: Tensor, view: Tensor, pixel: Tensor) -> Tensor:
     )
 
 
-def _reprojection(candidate: Candidate, matches: Matches, z: Tensor, usable: Tensor) -> PairScores:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Carried:
+    """Match ends with depth, in both directions, sorted by pair: a pixel with depth z lands at `turned` z + `shift`."""
+
+    turned: np.ndarray
+    """(3, n) homogeneous matching pixels of the other view for each unit of depth."""
+    shift: np.ndarray
+    """(3, n)."""
+    wanted: np.ndarray
+    """(2, n) the match's own pixel in the other view."""
+    pair: np.ndarray
+    """(n,)."""
+
+    def errors(self, factor: float) -> tuple[np.ndarray, np.ndarray]:
+        """Distances (n,) with all depths times a factor, inf behind the other camera, and the pairs (n,)."""
+        x, y, depth = self.turned * factor + self.shift
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = np.hypot(x / depth - self.wanted[0], y / depth - self.wanted[1])
+        return np.where(depth > 0, distance, np.inf), self.pair
+
+
+def _carried(candidate: Candidate, matches: Matches, keep: np.ndarray | None) -> _Carried:
+    z, smooth = _lifted(candidate, matches)
+    usable = smooth if keep is None else torch.from_numpy(keep) & ~z.isnan()
     first, second, x, y, K, T = _two_sides(candidate, matches)
-    errors = torch.stack(
-        (
-            _landing(x, z[:, 0], K[first], T, K[second], y),
-            _landing(y, z[:, 1], K[second], inverse(T), K[first], x),
-        ),
-        dim=1,
+    parts = []
+    for side, (here, there, own, other, motion) in enumerate(
+        ((first, second, x, y, T), (second, first, y, x, inverse(T)))
+    ):
+        chosen = usable[:, side]
+        infinite = (K[there] @ motion[:, :3, :3] @ torch.linalg.inv(K)[here])[chosen]
+        turned = _rows(infinite, _homogeneous(own[chosen])) * z[chosen, side, None]
+        shift = _rows(K[there[chosen]], motion[chosen, :3, 3])
+        parts.append((turned, shift, other[chosen], torch.from_numpy(matches.pair_of)[chosen]))
+    turned, shift, wanted, pair = (torch.cat(values) for values in zip(*parts, strict=True))
+    order = torch.argsort(pair, stable=True)
+    return _Carried(
+        turned=turned[order].T.numpy(),
+        shift=shift[order].T.numpy(),
+        wanted=wanted[order].T.numpy(),
+        pair=pair[order].numpy(),
     )
-    errors = torch.where(usable, errors, torch.nan).numpy()
-    return _medians(matches, errors, matches.reason() or _NO_DEPTH)
 
 
-def _landing(x: Tensor, z: Tensor, K_x: Tensor, T: Tensor, K_y: Tensor, y: Tensor) -> Tensor:
-    """Distance (n,) between pixels y and where pixels x with depth z appear; inf behind the camera."""
-    there = transform_points(T, _rows(torch.linalg.inv(K_x), _homogeneous(x)) * z[:, None])
-    distance = torch.linalg.vector_norm(project(there, K_y) - y, dim=-1)
-    return torch.where(there[:, 2] > 0, distance, torch.inf)
+def _medians(errors: np.ndarray, pair: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Median (P,) of the errors (n,) of each pair, and their number; `pair` (n,) is sorted.
 
-
-def _medians(matches: Matches, errors: np.ndarray, reason: str | None) -> PairScores:
-    """Median of each pair's errors (M, ...); nan is left out, inf (behind a camera) counts as a large error."""
-    values = np.full(len(matches.pairs), np.nan)
-    used = np.zeros(len(matches.pairs), dtype=np.int64)
-    for pair, (low, high) in enumerate(pairwise(matches.pair_start)):
-        known = errors[low:high][~np.isnan(errors[low:high])]
-        used[pair] = len(known)
-        if len(known) < FEWEST:
+    An error of inf (behind a camera) counts as `BEHIND` times the median of the others; nan for too few errors.
+    """
+    start = np.searchsorted(pair, np.arange(count + 1))
+    values = np.full(count, np.nan)
+    for number, (low, high) in enumerate(pairwise(start)):
+        if high - low < FEWEST:
             continue
-        behind = np.isinf(known)
-        # A pair with every point behind a camera has no median to count by.
-        values[pair] = (
-            np.inf if behind.all() else np.median(np.where(behind, BEHIND * np.median(known[~behind]), known))
-        )
-    return PairScores(pairs=matches.pairs, values=values, used=used, reason=reason if np.isnan(values).all() else None)
+        own = errors[low:high]
+        behind = np.isinf(own)
+        if behind.all():
+            # There is no median to count by.
+            values[number] = np.inf
+            continue
+        values[number] = np.median(np.where(behind, BEHIND * np.median(own[~behind]), own) if behind.any() else own)
+    return values, np.diff(start)
+
+
+def _pair_scores(matches: Matches, values: np.ndarray, used: np.ndarray, no_value: str | None) -> PairScores:
+    reason = (matches.reason() or no_value) if np.isnan(values).all() else None
+    return PairScores(pairs=matches.pairs, values=values, used=used, reason=reason)
+
+
+def _mean(values: np.ndarray) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else float("nan")
 
 
 def _homogeneous(pixel: Tensor) -> Tensor:
