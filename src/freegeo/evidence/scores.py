@@ -37,7 +37,7 @@ BEHIND = 8.0
 """A point behind a camera counts as so many times the median error."""
 FEWEST = 6
 """A pair with fewer usable matches has no evidence."""
-MOST_FITTED = 300
+MOST_FITTED = 200
 """With twice as many matches or more, `two_view` fits every second, third, ... of them."""
 FACTORS = (0.90, 1.10)
 """Range of the depth factor of `depth_scale`."""
@@ -110,17 +110,16 @@ def epipolar(candidate: Candidate, matches: Matches) -> PairScores:
     It sees errors of poses and focal lengths, and nothing of depth. Two cameras in one place have no epipolar lines;
     they map the first photo onto the second by a homography, and the match's first-order distance from that counts.
     """
-    first, second, x, y, K, T = _two_sides(candidate, matches)
-    R, t = T[:, :3, :3], T[:, :3, 3]
-    infinite = K[second] @ R @ torch.linalg.inv(K[first])
-    mapped = _rows(infinite, _homogeneous(x))
-    epipole = _rows(K[second], t)
-    line = torch.linalg.cross(epipole, mapped)
-    back = _rows(infinite.mT, torch.linalg.cross(_homogeneous(y), epipole))
+    sides = _sides(candidate, matches)
+    pair, x, y = sides.pair, _homogeneous(sides.x), _homogeneous(sides.y)
+    infinite, epipole = sides.mapping(forth=True)
+    mapped = _rows(infinite[pair], x)
+    line = torch.linalg.cross(epipole[pair], mapped)
+    back = _rows(infinite.mT[pair], torch.linalg.cross(y, epipole[pair]))
     steep = torch.sqrt(line[:, :2].square().sum(-1) + back[:, :2].square().sum(-1))
-    distance = (line * _homogeneous(y)).sum(-1).abs() / steep
-    transfer = torch.linalg.vector_norm(mapped[:, :2] / mapped[:, 2:] - y, dim=-1) / 2**0.5
-    distance = torch.where((t == 0).all(-1), transfer, distance)
+    distance = (line * y).sum(-1).abs() / steep
+    transfer = torch.linalg.vector_norm(mapped[:, :2] / mapped[:, 2:] - sides.y, dim=-1) / 2**0.5
+    distance = torch.where((epipole == 0).all(-1)[pair], transfer, distance)
     values, used = _medians(distance.numpy(), matches.pair_of, len(matches.pairs))
     return _pair_scores(matches, values, used, None)
 
@@ -134,11 +133,12 @@ def two_view(candidate: Candidate, matches: Matches, *, settings: MatchSettings 
     import cv2
 
     settings = settings or MatchSettings()
-    first, second, x, y, K, T = (value.numpy() for value in _two_sides(candidate, matches))
+    sides = _sides(candidate, matches)
+    x, y, K, own = (value.numpy() for value in (sides.x, sides.y, sides.K, sides.T))
     fitted = np.full((len(matches.pairs), 4, 4), np.nan)
     starts = matches.pair_start
     for pair, (low, high) in enumerate(pairwise(starts)):
-        i, j = first[low], second[low]
+        i, j = matches.pairs[pair]
         chosen = slice(low, high, max(1, (high - low) // MOST_FITTED))
         try:
             essential, mask = cv2.findEssentialMat(
@@ -152,7 +152,6 @@ def two_view(candidate: Candidate, matches: Matches, *, settings: MatchSettings 
             continue
         if in_front >= FEWEST:
             fitted[pair, :3, :3], fitted[pair, :3, 3] = R, t[:, 0]
-    own = T[starts[:-1]] if len(T) else np.zeros((0, 4, 4))
     rotation = torch.rad2deg(rotation_angle(*(torch.from_numpy(m[:, :3, :3]) for m in (own, fitted)))).numpy()
     with np.errstate(invalid="ignore"):
         length = np.linalg.norm(own[:, :3, 3], axis=1)
@@ -191,6 +190,8 @@ def depth_scale(candidate: Candidate, matches: Matches, *, keep: np.ndarray | No
 
     Depth and poses of a network can drift apart in scale while each of them looks better.
     """
+    from scipy.optimize import minimize_scalar
+
     carried = _carried(candidate, matches, keep)
 
     def error(factor: float) -> float:
@@ -199,22 +200,48 @@ def depth_scale(candidate: Candidate, matches: Matches, *, keep: np.ndarray | No
     start = error(1.0)
     if np.isnan(start):
         return DepthScale(factor=float("nan"), error_px=float("nan"), reason=matches.reason() or _NO_DEPTH)
-    best, step = (start, 1.0), 0.02
-    while step >= 0.0005:
-        tried = [best[1] + k * step for k in ((-5, -4, -3, -2, -1, 1, 2, 3, 4, 5) if step == 0.02 else (-2, -1, 1, 2))]
-        inside = [round(f, 6) for f in tried if FACTORS[0] - 1e-9 <= f <= FACTORS[1] + 1e-9]
-        best = min([best, *((error(f), f) for f in inside)])
-        step /= 3
-    return DepthScale(factor=best[1], error_px=best[0], reason=None)
+    found = minimize_scalar(error, bounds=FACTORS, method="bounded", options={"xatol": 5e-4})
+    best, factor = min((start, 1.0), (float(found.fun), float(found.x)))
+    return DepthScale(factor=factor, error_px=best, reason=None)
 
 
-def _two_sides(candidate: Candidate, matches: Matches) -> tuple[Tensor, ...]:
-    """First and second view (M,), pixels (M, 2), intrinsics (S, 3, 3) at matching size, relative poses (M, 4, 4)."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Sides:
+    """The matches in matching pixels, and a candidate's cameras for them."""
+
+    pairs: Tensor
+    """(P, 2) int64."""
+    pair: Tensor
+    """(M,) int64."""
+    x: Tensor
+    """(M, 2) float64 in the first view."""
+    y: Tensor
+    """(M, 2) in the second."""
+    K: Tensor
+    """(S, 3, 3)."""
+    T: Tensor
+    """(P, 4, 4) from the first view to the second."""
+
+    def mapping(self, *, forth: bool) -> tuple[Tensor, Tensor]:
+        """Matrices (P, 3, 3) and vectors (P, 3): a pixel with depth z appears at matrix @ pixel * z + vector."""
+        here, there = self.pairs.T if forth else self.pairs.flip(1).T
+        motion = self.T if forth else inverse(self.T)
+        infinite = self.K[there] @ motion[:, :3, :3] @ torch.linalg.inv(self.K[here])
+        return infinite, _rows(self.K[there], motion[:, :3, 3])
+
+
+def _sides(candidate: Candidate, matches: Matches) -> _Sides:
     _same_views(candidate, matches)
-    first, second = torch.from_numpy(matches.pairs[matches.pair_of]).T
+    pairs = torch.from_numpy(matches.pairs)
     x, y = torch.from_numpy(matches.in_matching_pixels()[matches.ends]).unbind(1)
-    K = candidate.matching_K(*map(torch.from_numpy, (matches.photo_hw, matches.match_hw)))
-    return first, second, x, y, K, relative(candidate.T_cam_world[first], candidate.T_cam_world[second])
+    return _Sides(
+        pairs=pairs,
+        pair=torch.from_numpy(matches.pair_of),
+        x=x,
+        y=y,
+        K=candidate.matching_K(*map(torch.from_numpy, (matches.photo_hw, matches.match_hw))),
+        T=relative(candidate.T_cam_world[pairs[:, 0]], candidate.T_cam_world[pairs[:, 1]]),
+    )
 
 
 def _same_views(candidate: Candidate, matches: Matches) -> None:
@@ -227,18 +254,16 @@ def _lifted(candidate: Candidate, matches: Matches) -> tuple[Tensor, Tensor]:
     _same_views(candidate, matches)
     view = torch.from_numpy(matches.view_of)
     pixel = candidate.in_model(view, torch.from_numpy(matches.keypoints))
-    depth = candidate.depth_z.detach().cpu().double()
-    depth = torch.where(valid_depth(depth), depth, torch.nan)
     ends = torch.from_numpy(matches.ends)
-    z, smooth = depth_at(depth, view, pixel)
+    z, smooth = depth_at(candidate.depth_z.detach().cpu(), view, pixel)
     return z[ends], smooth[ends]
 
 
 def depth_at(depth_z: Tensor, view: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
     """Depth (n,) at places (n, 2) of views (n,), and whether it is known and off depth edges.
 
-    Inverse depth is interpolated, because it is linear on planes; unknown depth (nan) next to the place, or a place
-    outside the map (S, H, W), gives nan.
+    Inverse depth is interpolated, because it is linear on planes; unknown depth next to the place, or a place outside
+    the map (S, H, W), gives nan.
     """
     height, width = depth_z.shape[1:]
     u, v = pixel.unbind(-1)
@@ -247,8 +272,8 @@ def depth_at(depth_z: Tensor, view: Tensor, pixel: Tensor) -> tuple[Tensor, Tens
     column, row = u.floor().long().clamp(0, max(width - 2, 0)), v.floor().long().clamp(0, max(height - 2, 0))
     right, below = min(1, width - 1), min(1, height - 1)
     a, b = (u - column).clamp(0, 1), (v - row).clamp(0, 1)
-    corners = (1 / depth_z[view, row + below * y, column + right * x] for y in (0, 1) for x in (0, 1))
-    one, two, three, four = corners
+    corners = (_known(depth_z[view, row + below * y, column + right * x]) for y in (0, 1) for x in (0, 1))
+    one, two, three, four = (1 / corner for corner in corners)
     z = 1 / ((1 - b) * ((1 - a) * one + a * two) + b * ((1 - a) * three + a * four))
     z = torch.where(inside, z, torch.nan)
     around = _neighbourhood(depth_z, view, pixel.round().long())
@@ -260,13 +285,15 @@ def _neighbourhood(depth_z: Tensor, view: Tensor, pixel: Tensor) -> Tensor:
     """The 3 x 3 depths (n, 9) around pixels (n, 2); the border is repeated."""
     height, width = depth_z.shape[1:]
     shifts = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)]
-    return torch.stack(
-        [
-            depth_z[view, (pixel[:, 1] + y).clamp(0, height - 1), (pixel[:, 0] + x).clamp(0, width - 1)]
-            for x, y in shifts
-        ],
-        dim=-1,
-    )
+    around = [
+        depth_z[view, (pixel[:, 1] + y).clamp(0, height - 1), (pixel[:, 0] + x).clamp(0, width - 1)] for x, y in shifts
+    ]
+    return _known(torch.stack(around, dim=-1))
+
+
+def _known(depth_z: Tensor) -> Tensor:
+    """Depth in double precision, nan where it is not usable."""
+    return torch.where(valid_depth(depth_z), depth_z, torch.nan).double()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -293,16 +320,14 @@ class _Carried:
 def _carried(candidate: Candidate, matches: Matches, keep: np.ndarray | None) -> _Carried:
     z, smooth = _lifted(candidate, matches)
     usable = smooth if keep is None else torch.from_numpy(keep) & ~z.isnan()
-    first, second, x, y, K, T = _two_sides(candidate, matches)
+    sides = _sides(candidate, matches)
     parts = []
-    for side, (here, there, own, other, motion) in enumerate(
-        ((first, second, x, y, T), (second, first, y, x, inverse(T)))
-    ):
+    for side, (own, other) in enumerate(((sides.x, sides.y), (sides.y, sides.x))):
         chosen = usable[:, side]
-        infinite = (K[there] @ motion[:, :3, :3] @ torch.linalg.inv(K)[here])[chosen]
-        turned = _rows(infinite, _homogeneous(own[chosen])) * z[chosen, side, None]
-        shift = _rows(K[there[chosen]], motion[chosen, :3, 3])
-        parts.append((turned, shift, other[chosen], torch.from_numpy(matches.pair_of)[chosen]))
+        pair = sides.pair[chosen]
+        infinite, shift = sides.mapping(forth=side == 0)
+        turned = _rows(infinite[pair], _homogeneous(own[chosen])) * z[chosen, side, None]
+        parts.append((turned, shift[pair], other[chosen], pair))
     turned, shift, wanted, pair = (torch.cat(values) for values in zip(*parts, strict=True))
     order = torch.argsort(pair, stable=True)
     return _Carried(
