@@ -104,9 +104,9 @@ def join_matches(matches: Matches, pairs: np.ndarray | None = None) -> MeasuredT
 def triangulate(candidate: Candidate, matches: Matches, tracks: MeasuredTracks) -> Triangulated:
     """S6, first half: triangulate tracks with a candidate's cameras.
 
-    The point of a track is the one nearest to its rays (least squares of the distances), then moved once towards the
-    least squared reprojection error by weighting each ray with its depth. A point behind one of its cameras, or of rays
-    that are parallel, has no coordinates.
+    The point of a track is the one nearest to its rays (least squares of the distances), found again twice with each
+    distance divided by that from the camera, which makes it nearly the least squared reprojection error. A point behind
+    one of its cameras, or of rays that are parallel, has no coordinates.
     """
     if len(candidate) != len(matches):
         raise ValueError(f"a candidate of {len(candidate)} views and matches of {len(matches)} photos")
