@@ -21,7 +21,7 @@ from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapt import Adapted, Progress, loss_change
 from freegeo.adaptation.adapt import adapt as train_adapter
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.adapter_files import METADATA
+from freegeo.adaptation.adapter_files import ADAPTER_FOLDER, METADATA
 from freegeo.adaptation.memory import plan_reconstruction
 from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Recipe
 from freegeo.adaptation.samples import SceneImages
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 SUMMARY_NAME = "reconstruction.json"
-FROZEN_FOLDER, ADAPTER_FOLDER = "frozen", "adapter"
+FROZEN_FOLDER = "frozen"
 FILES_STAGE = "points and files"
 ADAPTATION = Part("adaptation", (f"{ADAPTER_FOLDER}/",))
 PREDICTION = Part("prediction", (f"{FROZEN_FOLDER}/{PREDICTION_NAME}", PREDICTION_NAME, f"{COPIES_FOLDER}/"))
@@ -166,7 +166,7 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
     UserError when the folder holds no adapter, when it was made for another model, or when the model carries one.
     """
     _require_model(model)
-    return adapter_files.load_adapter(model, Path(folder).expanduser())
+    return adapter_files.load_adapter(model, folder)
 
 
 def adapt(
