@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import logging
 import struct
 import sys
 from collections import OrderedDict
@@ -386,11 +385,33 @@ def test_a_family_of_models_is_added_by_naming_its_module(monkeypatch):
     assert isinstance(catalog.build_empty("new"), nn.Identity)
 
 
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("depth-anything/DA3-BASE", "da3-base"),
+        ("depth-anything/da3-giant-1.1", "da3-giant"),
+        ("https://huggingface.co/facebook/VGGT-1B", "vggt-1b"),
+        ("DA3-Small", "da3-small"),
+        ("depth-anything/DA3MONO-LARGE", "da3mono-large"),
+    ],
+)
+def test_models_are_found_by_their_id_on_the_hub(name, found):
+    assert catalog.entry(name).name == found
+
+
+def test_a_model_that_is_given_by_another_name_has_its_own(tmp_path):
+    embedded = catalog.load_model("FreeGeo-Tiny")
+    assert embedded.loaded_from.model == embedded.spec.name == "freegeo-tiny"
+
+
 def test_unknown_names_list_the_known_ones():
     with pytest.raises(UserError, match=r"unknown model 'vgt'.*da3-base.*vggt-1b, vggt-1b-commercial"):
         catalog.load_model("vgt")
-    with pytest.raises(UserError, match="not implemented yet"):
+    with pytest.raises(UserError, match=r"da3mono-large is not implemented: .*use da3-small"):
         catalog.load_model("da3mono-large")
+    with pytest.raises(UserError, match="unknown model 'someone/DA3-BASE'") as error:
+        catalog.load_model("someone/DA3-BASE")
+    assert "mono" not in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -419,56 +440,6 @@ def test_totals_are_the_published_ones():
         "vggt-1b": 1_256_537_516,
     }
     assert {name: catalog.entry(name).parameters for name in published} == published
-
-
-@pytest.fixture
-def hub(monkeypatch):
-    """The hub library without a network or a cache: what it was asked for, and whether the hub answers."""
-    import huggingface_hub
-    from huggingface_hub.errors import LocalEntryNotFoundError
-
-    class Hub:
-        answers, cached, asked = True, None, []
-
-    def metadata(url, *, timeout):
-        assert timeout <= 10
-        if not Hub.answers:
-            logging.getLogger("huggingface_hub.utils").warning("noise")
-            huggingface_hub.get_session().get("nowhere://hub")  # fails with the error of whichever client it is
-
-    def download(*where):
-        Hub.asked = [*Hub.asked, where]
-        raise LocalEntryNotFoundError("offline")
-
-    monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", lambda *where: Hub.cached)
-    monkeypatch.setattr(huggingface_hub, "get_hf_file_metadata", metadata)
-    monkeypatch.setattr(huggingface_hub, "hf_hub_download", download)
-    return Hub
-
-
-def test_failed_download_says_what_to_do(hub):
-    with pytest.raises(UserError, match=r"Go online and run `freegeo models download vggt-1b`"):
-        catalog.load_model("vggt-1b")
-    with pytest.raises(UserError, match=r"Accept its licence at https://huggingface\.co/facebook/VGGT-1B-Commercial"):
-        catalog.load_model("vggt-1b-commercial")
-    assert hub.asked == [
-        ("facebook/VGGT-1B", "model.safetensors"),
-        ("facebook/VGGT-1B-Commercial", "vggt_1B_commercial.pt"),
-    ]
-
-
-def test_unreachable_hub_is_noticed_before_the_download_and_without_noise(hub, caplog):
-    hub.answers = False
-    with pytest.raises(UserError, match="could not be downloaded"):
-        catalog.download("da3-small")
-    assert hub.asked == []
-    assert "noise" not in caplog.text
-    assert logging.getLogger("huggingface_hub").level != logging.CRITICAL
-
-
-def test_downloaded_checkpoint_needs_no_network(hub):
-    hub.answers, hub.cached = False, "/cache/model.safetensors"
-    assert catalog.download("da3-small").as_posix() == "/cache/model.safetensors"
 
 
 @pytest.mark.parametrize(("name", "folder"), [("small-da3", DA3), ("small-vggt", VGGT)])
