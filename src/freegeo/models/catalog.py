@@ -99,6 +99,7 @@ def download(name: str, *, check_hash: bool = False) -> Path:
     `check_hash` reads the whole of a file that is there already; without it, its length is checked.
     """
     item = entry(name)
+    _buildable(name)
     if item.packaged_weights is not None:
         return item.packaged_weights
     if item.hub_id is None:
