@@ -170,7 +170,7 @@ def test_example_in_the_documentation_is_a_config(caught, tmp_path):
     text = "\n".join(lines)
     assert set(tomllib.loads(text)) == {"run"}
     assert main(["run", "--config", config(tmp_path, text)]) == 0
-    (sources, _), ((_, _, model, output), options) = caught
+    (sources, _), ((_, model, output), options) = caught
     assert (sources, str(output.output), model.model, options["recipe"].steps) == (("photos",), "out", "da3-giant", 50)
 
 

@@ -49,9 +49,10 @@ def fetch(item: ModelEntry, *, check_hash: bool = False) -> Path:
         logger.debug("download of %s failed: %r", item.hub_id, error)
         reason, remedy = _why(error, item)
         missing = "is not on this machine" if kept is None else f"is damaged ({kept})"
+        size = f"{item.download_bytes / 1e9:.1f} GB"
         raise UserError(
-            f"the checkpoint of {item.name} ({item.hub_id}, {item.download_gb:.1f} GB) {missing} and could not be "
-            f"downloaded: {reason}. {remedy} and run `freegeo models download {item.name}`, {_INSTEAD}"
+            f"the checkpoint of {item.name} ({item.hub_id}, {size}) {missing} and could not be downloaded: {reason}. "
+            f"{remedy} and run `freegeo models download {item.name}`, {_INSTEAD}"
         ) from None
     if not is_intact(path, digest):
         raise UserError(

@@ -81,9 +81,9 @@ class ModelEntry:
     """Weights that come with an installed package."""
 
     @property
-    def download_gb(self) -> float:
+    def download_bytes(self) -> int:
         """Size of the float32 checkpoint."""
-        return self.parameters * 4 / 1e9
+        return self.parameters * 4
 
 
 @dataclass(frozen=True, kw_only=True)
