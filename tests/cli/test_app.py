@@ -12,6 +12,7 @@ import pytest
 from freegeo import __version__
 from freegeo.cli import app, console
 from freegeo.cli.app import COMMANDS, main
+from freegeo.cli.models import adaptation_bytes, reconstruction_bytes
 from freegeo.models import catalog
 
 
@@ -326,6 +327,26 @@ def test_describe_counts_what_an_adapter_trains(freegeo, name, counts):
     assert f"licence of the weights: {catalog.entry(name).licence}" in outcome.out
     for count in counts:
         assert count in outcome.out
+
+
+def test_models_show_the_download_and_the_memory(freegeo):
+    lines = {line.split()[0]: line for line in freegeo("models").out.splitlines() if line.strip()}
+    assert "5.4 GB" in lines["da3-giant"] and "5.0 GB" in lines["vggt-1b"]
+    assert "included" in lines["freegeo-tiny"]
+    memory = {name: reconstruction_bytes(catalog.build_empty(name)) for name in ("da3-base", "da3-giant")}
+    assert memory["da3-base"] < memory["da3-giant"]
+    for name, size in memory.items():
+        assert f"{size / 1e9:.1f} GB" in lines[name]
+
+
+def test_describe_says_how_much_memory_is_needed(freegeo):
+    out = freegeo("models", "describe", "depth-anything/DA3-BASE").out
+    assert out.startswith("da3-base: ")
+    built = catalog.build_empty("da3-base")
+    fast, small = adaptation_bytes(built)
+    assert reconstruction_bytes(built) > 4 * 135_366_599
+    assert fast > small > 4 * 135_366_599
+    assert f"to adapt on a GPU {fast / 1e9:.1f} GB, or {small / 1e9:.1f} GB where that does not fit" in out
 
 
 @pytest.mark.parametrize("command", [("describe",), ("download",), ("check",)])
