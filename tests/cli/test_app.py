@@ -183,6 +183,15 @@ def test_sources_in_a_config_stand_back_for_those_on_the_command_line(caught, tm
     assert [sources for sources, _ in caught[::2]] == [("a", "b") if "b" in written else ("a",), ("x", "y")]
 
 
+def test_the_home_folder_is_found_in_lists_and_tables_below_tables(caught, freegeo, monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    file = config(tmp_path, '[run]\noutput = "~/out"\nsources = ["~/a"]\n[models.check]\ncheckpoint = "~/none.pt"\n')
+    assert main(["run", "--config", file]) == 0
+    assert (caught[0][0], str(caught[1][0][2].output)) == ((str(tmp_path / "a"),), str(tmp_path / "out"))
+    assert f"{tmp_path / 'none.pt'}: no such" in freegeo("models", "check", "da3-base", "--config", file).sentence()
+
+
 def test_lists_in_a_config_reach_options_that_take_several_values_or_a_list_in_one(caught, tmp_path):
     file = config(
         tmp_path,
