@@ -18,7 +18,6 @@ from freegeo.geometry.depth import depth_to_world, unproject, valid_depth
 from freegeo.geometry.rotation import matrix_to_quat_xyzw, quat_xyzw_to_matrix
 from freegeo.geometry.se3 import inverse, to_4x4
 from freegeo.models.dpt import depth_maps, uv_embedding
-from freegeo.models.spec import KeyRules
 from freegeo.models.transformer import position_table, rope_table, rotate
 from freegeo.models.vggt import CameraHead, point_map
 from freegeo.models.vggt_images import plan_size, preprocess
@@ -111,8 +110,8 @@ def check_activations(path: Path) -> float:
 def check_camera_head(path: Path) -> float:
     values = load_file(path)
     head = CameraHead(channels=64, depth=1, heads=4)
-    names = KeyRules(prefix="camera_head.").translate([n for n in values if n.startswith("camera_head.")])
-    head.load_state_dict({ours: values[name].float() for ours, name in names.items()})
+    prefix = "camera_head."
+    head.load_state_dict({k.removeprefix(prefix): v.float() for k, v in values.items() if k.startswith(prefix)})
     poses = head(values["tokens_last"][:, :, 0], steps=6)
     return max(relative_error(pose, values[f"pose_enc.{step}"]) for step, pose in enumerate(poses)) / NETWORK
 

@@ -159,7 +159,7 @@ def test_adapters_that_cannot_be_used(model, saved, tmp_path):
     with pytest.raises(UserError, match=r"Adapter\(tiny-da3, rank 4, on\) belongs to another model"):
         freegeo.reconstruct(model, pictures(), adapter=other)
     with pytest.raises(UserError, match="not an adapter folder"):
-        freegeo.reconstruct(model, pictures(), adapter=tmp_path)
+        freegeo.reconstruct(model, pictures(), adapter=tmp_path / "nothing")
     with pytest.raises(UserError, match="not dict"):
         freegeo.reconstruct(model, pictures(), adapter={})
     adapter = freegeo.load_adapter(model, saved)

@@ -21,7 +21,7 @@ from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapt import Adapted, Progress, loss_change
 from freegeo.adaptation.adapt import adapt as train_adapter
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.adapter_files import METADATA
+from freegeo.adaptation.adapter_files import ADAPTER_FOLDER, METADATA
 from freegeo.adaptation.memory import plan_reconstruction
 from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Recipe
 from freegeo.adaptation.samples import SceneImages
@@ -39,6 +39,7 @@ from freegeo.files import FORMAT, as_json, read_json, write_json
 from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
+from freegeo.models.catalog import EMBEDDED_MODEL, warn_of_embedded_model
 from freegeo.models.precision import Compute
 from freegeo.models.spec import ModelSpec
 from freegeo.progress import step_bar
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 SUMMARY_NAME = "reconstruction.json"
-FROZEN_FOLDER, ADAPTER_FOLDER = "frozen", "adapter"
+FROZEN_FOLDER = "frozen"
 FILES_STAGE = "points and files"
 ADAPTATION = Part("adaptation", (f"{ADAPTER_FOLDER}/",))
 PREDICTION = Part("prediction", (f"{FROZEN_FOLDER}/{PREDICTION_NAME}", PREDICTION_NAME, f"{COPIES_FOLDER}/"))
@@ -61,6 +62,7 @@ FORMATS = Part("formats", (), free=True)
 PARTS = (ADAPTATION, PREDICTION, FILTERS, FORMATS)
 """Parts of a job's settings: photos, model and adapter; how they are used; which pixels become points; which files."""
 CPU = Compute()
+_warned_of: list[str] = []
 
 
 @torch.no_grad()
@@ -128,6 +130,7 @@ def reconstruct(
         UserError: an argument that cannot be used, or views that do not fit into memory together.
     """
     _require_model(model)
+    _warn_of_embedded_model(model)
     compute = Compute.choose(device, precision)
     batch = model.preprocess(load_photos(photos, max_views))
     with _applied(model, adapter):
@@ -166,7 +169,7 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
     UserError when the folder holds no adapter, when it was made for another model, or when the model carries one.
     """
     _require_model(model)
-    return adapter_files.load_adapter(model, Path(folder).expanduser())
+    return adapter_files.load_adapter(model, folder)
 
 
 def adapt(
@@ -224,6 +227,7 @@ def adapt(
         FreeGeoError: a loss or gradient that is not finite.
     """
     _require_model(model)
+    _warn_of_embedded_model(model)
     compute = Compute.choose(device, precision)
     plan = _recipe(recipe, model, dataset).changed(
         steps=steps, epochs=epochs, lr=lr, rank=rank, hold=hold, views=views,
@@ -252,6 +256,13 @@ def _require_model(model: object) -> None:
         return
     hint = f"freegeo.load_model({model!r})" if isinstance(model, str) else "freegeo.load_model"
     raise UserError(f"model is a loaded model, not {type(model).__name__}. Load it with {hint}.")
+
+
+def _warn_of_embedded_model(model: ReconstructionModel) -> None:
+    """Say once what the embedded model is not for."""
+    if model.spec.name == EMBEDDED_MODEL and not _warned_of:
+        _warned_of.append(EMBEDDED_MODEL)
+        warn_of_embedded_model()
 
 
 def scene_images(

@@ -1,6 +1,7 @@
 """Adapters come back bit for bit, peft reads ours, the authors' layout passes both ways, the rest is refused."""
 
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -13,9 +14,12 @@ from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.adapter_files import (
     adapter_metadata,
     export_published,
+    find_adapter,
     load_adapter,
     lora_layers,
     own_names,
+    read_camera_token,
+    read_peft,
     save_adapter,
 )
 from freegeo.errors import FreeGeoError, UserError
@@ -235,29 +239,156 @@ def test_damaged_files_are_named(tmp_path):
     [
         ({"peft_type": "LOHA"}, "holds a LOHA adapter; only LoRA"),
         ({"use_rslora": True}, "uses use_rslora; only plain LoRA"),
-        ({"use_dora": True, "rank_pattern": {"attn.qkv": 2}}, "uses use_dora, rank_pattern"),
+        ({"rank_pattern": {"attn.qkv": 2}, "use_dora": True}, "uses rank_pattern, use_dora"),
+        ({"alpha_pattern": {"attn.qkv": 2}}, "uses alpha_pattern"),
+        ({"bias": "all"}, "uses bias"),
+        ({"lora_bias": True}, "uses lora_bias"),
+        ({"target_parameters": ["attn.qkv.weight"]}, "uses target_parameters"),
+        ({"a_setting_of_a_later_peft": {"on": True}}, "uses a_setting_of_a_later_peft"),
+        ({"init_lora_weights": "pissa"}, "initialised by pissa, which changes the weights of the model"),
+        ({"init_lora_weights": "pissa_niter_4"}, "initialised by pissa_niter_4"),
+        ({"init_lora_weights": "olora"}, "initialised by olora"),
+        ({"init_lora_weights": "corda"}, "initialised by corda"),
+        ({"init_lora_weights": "loftq"}, "initialised by loftq"),
+        ({"init_lora_weights": "lora_ga"}, "initialised by lora_ga"),
+        ({"r": 0}, "are not those of an adapter"),
+        ({"r": "4"}, "are not those of an adapter"),
+        ({"lora_alpha": math.nan}, "are not those of an adapter"),
+        ({"lora_alpha": None}, "are not those of an adapter"),
     ],
 )
-def test_adapters_that_compute_something_else_are_refused(change, words, tmp_path):
-    saved(tiny_da3, tmp_path)
-    path = tmp_path / "adapter_config.json"
+def test_adapters_that_compute_something_else_are_refused(change, words, plain, tmp_path):
+    path = shutil.copytree(plain, tmp_path / "copy") / "adapter_config.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    refused(tiny_da3(), tmp_path, words)
+    refused_when_read(path.parent, words)
 
 
-def test_tensors_that_do_not_fit_are_counted_and_named(tmp_path):
-    saved(tiny_da3, tmp_path / "whole")
-    tensors = load_file(tmp_path / "whole" / "adapter_model.safetensors")
-    first = next(iter(tensors))
-    for case, changed, words in (
-        ("less", {k: v for k, v in tensors.items() if k != first}, "1 missing"),
-        ("other", tensors | {first: torch.zeros(9, 9)}, r"1 of another shape \(first: .* is \(9, 9\), expected"),
-        ("more", tensors | {"base_model.model.bias": torch.zeros(1)}, r"1 unexpected \(first: bias\)"),
-        ("none", {"base_model.model.bias": torch.zeros(1)}, "no LoRA matrices"),
-    ):
-        shutil.copytree(tmp_path / "whole", tmp_path / case)
-        save_file(changed, tmp_path / case / "adapter_model.safetensors")
-        refused(tiny_da3(), tmp_path / case, words)
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory) -> Path:
+    """A saved adapter, to copy and spoil."""
+    folder = tmp_path_factory.mktemp("plain") / "adapter"
+    save_adapter(trained(tiny_da3()), folder, METADATA)
+    return folder
+
+
+def refused_when_read(folder: Path, words: str) -> None:
+    """A refusal that needs no model."""
+    with pytest.raises(UserError, match=words) as error:
+        read_peft(folder)
+    assert "\n" not in str(error.value)
+    assert str(folder) in str(error.value)
+
+
+@pytest.mark.filterwarnings("ignore:.*EVA config")
+@pytest.mark.parametrize("start", [True, False, "gaussian", "orthogonal", "mica", "eva"])
+def test_every_initialisation_that_is_accepted_computes_what_peft_computes(start, tmp_path):
+    wrapped = peft.get_peft_model(
+        tiny_da3(), peft.LoraConfig(r=2, lora_alpha=2, target_modules=tiny_da3().adapter_targets())
+    )
+    wrapped.peft_config["default"].init_lora_weights = start
+    for name, parameter in wrapped.named_parameters():
+        if "lora_B" in name:
+            torch.nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(3))
+    wrapped.save_pretrained(tmp_path)
+    model = tiny_da3()
+    load_adapter(model, tmp_path)
+    by_peft = peft.PeftModel.from_pretrained(tiny_da3(), tmp_path).get_base_model().eval()
+    assert not same(outputs(model, IMAGES), outputs(tiny_da3(), IMAGES))
+    assert same(outputs(model, IMAGES), outputs(by_peft, IMAGES))
+
+
+@pytest.mark.filterwarnings("ignore:.*changes the base weights")
+@pytest.mark.parametrize("start", ["pissa", "olora"])
+def test_an_adapter_that_changes_the_model_is_refused_until_peft_has_converted_it(start, tmp_path):
+    targets = tiny_da3().adapter_targets()
+    config = peft.LoraConfig(r=2, lora_alpha=2, target_modules=targets, init_lora_weights=start)
+    wrapped = peft.get_peft_model(tiny_da3(), config)
+    wrapped.peft_config["default"].init_lora_weights = True  # what peft asks for before a later conversion
+    wrapped.save_pretrained(tmp_path / "start")
+    wrapped.peft_config["default"].init_lora_weights = start
+    for name, parameter in wrapped.named_parameters():
+        if "lora_B" in name:
+            parameter.data += 0.05
+    wrapped.save_pretrained(tmp_path / "plain")
+    refused(tiny_da3(), tmp_path / "plain", f"initialised by {start}.*path_initial_model_for_weight_conversion")
+    wrapped.save_pretrained(tmp_path / "converted", path_initial_model_for_weight_conversion=str(tmp_path / "start"))
+    model = tiny_da3()
+    load_adapter(model, tmp_path / "converted")
+    for found, wanted in zip(outputs(model, IMAGES), outputs(wrapped.get_base_model().eval(), IMAGES), strict=True):
+        torch.testing.assert_close(found, wanted, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_adapters_with_values_that_are_not_finite_are_refused(value, plain, tmp_path):
+    """Published adapters have the same two files, in a folder of this name."""
+    folder = shutil.copytree(plain, tmp_path / "latest_lora_peft")
+    path = folder / "adapter_model.safetensors"
+    tensors = load_file(path)
+    tensors[sorted(tensors)[5]][1, 0] = value
+    save_file(tensors, path)
+    refused_when_read(folder, "1 tensors hold values that are not finite")
+
+
+def test_camera_tokens_with_values_that_are_not_finite_are_refused(plain, tmp_path):
+    ours = shutil.copytree(plain, tmp_path / "ours")
+    token = load_file(ours / "camera_token.safetensors")["camera_token"] * math.nan
+    save_file({"camera_token": token}, ours / "camera_token.safetensors")
+    refused(tiny_da3(), ours, r"camera_token\.safetensors: 1 tensors hold values that are not finite")
+    torch.save({"camera_token": token}, tmp_path / "latest_lora.pt")
+    with pytest.raises(UserError, match=r"latest_lora\.pt: 1 tensors hold values that are not finite"):
+        read_camera_token(tmp_path / "latest_lora_peft")
+
+
+def test_adapters_in_eight_bits_are_refused(plain, tmp_path):
+    path = shutil.copytree(plain, tmp_path / "copy") / "adapter_model.safetensors"
+    save_file({name: value.to(torch.float8_e4m3fn) for name, value in load_file(path).items()}, path)
+    refused_when_read(path.parent, "stored as float8_e4m3fn.*Use weights in float32")
+
+
+def test_our_own_adapter_needs_its_camera_token(build, tmp_path):
+    saved(build, tmp_path)
+    (tmp_path / "camera_token.safetensors").unlink()
+    refused(build(), tmp_path, "this file of the adapter is missing")
+
+
+@pytest.mark.parametrize(
+    "place", ["out", "out/adapter", "out/adapter/adapter_config.json", "out/adapter/adapter_model.safetensors", "~/out"]
+)
+def test_an_adapter_is_found_in_the_folder_of_its_run(place, plain, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    shutil.copytree(plain, tmp_path / "out" / "adapter")
+    assert find_adapter(place if place.startswith("~") else tmp_path / place) == tmp_path / "out" / "adapter"
+
+
+def test_loading_takes_the_folder_of_a_run(build, tmp_path):
+    _, adapted = saved(build, tmp_path / "adapter")
+    model = build()
+    load_adapter(model, tmp_path)
+    assert same(outputs(model, IMAGES), adapted)
+
+
+def test_a_folder_with_published_adapters_stands_for_the_only_one(tmp_path):
+    adapter = trained(tiny_da3())
+    export_published(adapter, tmp_path, "latest")
+    assert find_adapter(tmp_path) == tmp_path / "latest_lora_peft"
+    export_published(adapter, tmp_path, "epoch_2")
+    with pytest.raises(UserError, match=r"several adapters \(epoch_2_lora_peft, latest_lora_peft\)"):
+        find_adapter(tmp_path)
+
+
+@pytest.mark.parametrize("content", ["[]", "{}", '{"format": 1, "base": "da3-base"}', '{"base": {"model": "x"}}'])
+def test_a_page_that_says_nothing_is_refused(content, tmp_path):
+    (tmp_path / "freegeo.json").write_text(content)
+    with pytest.raises(UserError, match="does not describe an adapter"):
+        adapter_metadata(tmp_path)
+
+
+@pytest.mark.parametrize("content", ["[]", "{}", '"LORA"'])
+def test_a_configuration_that_says_nothing_is_refused(content, plain, tmp_path):
+    folder = shutil.copytree(plain, tmp_path / "copy")
+    (folder / "adapter_config.json").write_text(content)
+    refused_when_read(folder, "holds a different adapter; only LoRA")
 
 
 def test_a_page_of_a_newer_format_is_refused(tmp_path):

@@ -1,13 +1,18 @@
 """The program itself: help, version, messages, config files, and the table of models."""
 
+import io
 import logging
+import os
+import sys
 import tomllib
+from pathlib import Path
 
 import pytest
 
 from freegeo import __version__
 from freegeo.cli import app, console
 from freegeo.cli.app import COMMANDS, main
+from freegeo.cli.models import adaptation_bytes, reconstruction_bytes
 from freegeo.models import catalog
 
 
@@ -136,7 +141,11 @@ def test_the_home_folder_may_be_short_in_a_config(caught, tmp_path, monkeypatch)
     ("text", "words"),
     [
         ("[run]\nstepz = 2\n", "stepz"),
-        ('[run]\nsteps = "many"\n', 'unable to convert "many" into int'),
+        ('[run]\nsteps = "many"\n', "'many' is not a whole number"),
+        ("[run]\nsteps = 1.5\n", "'1.5' is not a whole number"),
+        ('[run]\nlr = "fast"\n', "'fast' is not a number"),
+        ('[run]\noverwrite = "perhaps"\n', "'perhaps' is not true or false"),
+        ("[run]\nsource = 'x'\n", "Unknown option: source from"),
         ("[rnu]\nsteps = 2\n", "'rnu' is no table of a command"),
         ("steps = 2\n", "'steps' is no table of a command"),
         ("[run]\nno-adapt = true\n", "write adapt = false instead of no-adapt in [run]"),
@@ -161,7 +170,46 @@ def test_example_in_the_documentation_is_a_config(caught, tmp_path):
     lines = [line.strip() for line in (app.__doc__ or "").splitlines() if line.startswith("    ")]
     text = "\n".join(lines)
     assert set(tomllib.loads(text)) == {"run"}
-    assert main(["run", "x", "-o", "out", "--config", config(tmp_path, text)]) == 0
+    assert main(["run", "--config", config(tmp_path, text)]) == 0
+    (sources, _), ((_, model, output), options) = caught
+    assert (sources, str(output.output), model.model, options["recipe"].steps) == (("photos",), "out", "da3-giant", 50)
+
+
+@pytest.mark.parametrize("written", ['["a", "b"]', '"a"'])
+def test_sources_in_a_config_stand_back_for_those_on_the_command_line(caught, tmp_path, written):
+    file = config(tmp_path, f'[run]\noutput = "out"\nsources = {written}\n')
+    assert main(["run", "--config", file]) == 0
+    assert main(["run", "x", "y", "--config", file]) == 0
+    assert [sources for sources, _ in caught[::2]] == [("a", "b") if "b" in written else ("a",), ("x", "y")]
+
+
+def test_the_home_folder_is_found_in_lists_and_tables_below_tables(caught, freegeo, monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    file = config(tmp_path, '[run]\noutput = "~/out"\nsources = ["~/a"]\n[models.check]\ncheckpoint = "~/none.pt"\n')
+    assert main(["run", "--config", file]) == 0
+    assert (caught[0][0], str(caught[1][0][2].output)) == ((str(tmp_path / "a"),), str(tmp_path / "out"))
+    assert f"{tmp_path / 'none.pt'}: no such" in freegeo("models", "check", "da3-base", "--config", file).sentence()
+
+
+def test_lists_in_a_config_reach_options_that_take_several_values_or_a_list_in_one(caught, tmp_path):
+    file = config(
+        tmp_path,
+        '[run]\nkeep = [0, 2, 4]\nloss = ["weight_kq=0", "num_query=9"]\nformats = ["ply", "mesh"]\nmasks = "m"\n',
+    )
+    assert main(["run", "x", "-o", "out", "--config", file]) == 0
+    options = caught[1][1]
+    assert (options["recipe"].keep, options["recipe"].loss) == ("0,2,4", ("weight_kq=0", "num_query=9"))
+    assert list(options["files"].formats) == ["ply", "mesh"]
+    assert str(options["files"].filters.masks) == "m"
+
+
+def test_commands_below_commands_have_tables_too(freegeo, tmp_path):
+    file = config(tmp_path, '[models.describe]\nmodel = "freegeo-tiny"\n[models.check]\nmodel = "da3-base"\n')
+    assert freegeo("models", "describe", "--config", file).out.startswith("freegeo-tiny: ")
+    assert "needs CHECKPOINT" in freegeo("models", "check", "--config", file).sentence()
+    file = config(tmp_path, '[bench.run]\nexperiments = ["main", "nonsense"]\n')
+    assert "nonsense" in freegeo("bench", "run", "--config", file).sentence()
 
 
 def test_config_works_for_a_whole_run(freegeo, photo_folder, tiny, tmp_path):
@@ -170,6 +218,96 @@ def test_config_works_for_a_whole_run(freegeo, photo_folder, tiny, tmp_path):
     )
     assert freegeo("reconstruct", photo_folder, "--config", file).code == 0
     assert (tmp_path / "out" / "prediction.npz").is_file()
+
+
+# -- what the parser says
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("run x -o", "-o needs a value: -o PATH. Folder for the results."),
+        ("run x -o o --steps", "--steps needs a value: --steps N. "),
+        ("run x -o o --lr", "--lr needs a value: --lr X. "),
+        ("run x -o o --keep", "--keep needs a value: --keep TEXT. "),
+        ("run x -o o --recipe", "--recipe needs a value: --recipe scene|paper|released-da3|released-vggt. "),
+        ("run x -o o --loss", "--loss needs a value: --loss TEXT. Settings of the loss, such as weight_kq=0"),
+        ("run x", "`freegeo run` needs --output PATH. Folder for the results."),
+        ("models describe", "`freegeo models describe` needs MODEL. "),
+        ("adapter merge", "`freegeo adapter merge` needs ADAPTER. "),
+        ("run x -o o --steps many", "--steps: 'many' is not a whole number."),
+        ("run x -o o --rank 3.7", "--rank: '3.7' is not a whole number."),
+        ("run x -o o --seed 1e3", "--seed: '1e3' is not a whole number."),
+        ("run x -o o --lr fast", "--lr: 'fast' is not a number."),
+        ("run x -o o --no-adapt=3", "--no-adapt: '3' is not true or false."),
+        ("run x -o o --seed 1 --seed 2", "--seed is given more than once. Give it once."),
+        ("export a b -f ply", "'b' is not expected here; `freegeo export --help` shows what is."),
+        ("run x -o o --formats obj", "Unknown export format 'obj'. Choose from npz, ply, glb"),
+        ("run x -o o --stepz 3", "Unknown option: --stepz. Did you mean --steps?"),
+        ("runn x", 'Unknown command "runn". Did you mean "run"?'),
+    ],
+)
+def test_mistakes_on_the_command_line_show_what_would_be_right(freegeo, line, sentence):
+    outcome = freegeo(*line.split())
+    assert outcome.code == 2
+    assert outcome.sentence().startswith(f"freegeo: {sentence}")
+    assert outcome.err.count("\n") == 1
+
+
+# -- streams
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "ascii", "cp932"])
+def test_text_that_a_stream_cannot_encode_is_escaped(monkeypatch, encoding):
+    streams = {name: io.TextIOWrapper(io.BytesIO(), encoding=encoding) for name in ("stdout", "stderr")}
+    for name, stream in streams.items():
+        monkeypatch.setattr(sys, name, stream)
+    assert main(["models", "describe", "模型 é"]) == 2
+    console.say("é 模型 \udcff")
+    for stream in streams.values():
+        written = stream.buffer.getvalue().decode(encoding)
+        assert "模型" in written or "\\u6a21\\u578b" in written
+    assert "\\udcff" in streams["stdout"].buffer.getvalue().decode(encoding)
+
+
+@pytest.mark.parametrize("arguments", [[], ["--version"], ["models"], ["models", "describe", "nothing"]])
+def test_closed_streams_are_no_mistake(monkeypatch, arguments):
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "stderr", None)
+    assert main(arguments) == (2 if "nothing" in arguments else 0)
+    console.finish_streams()
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["models"]])
+def test_a_reader_that_goes_away_ends_nothing(monkeypatch, capfd, arguments):
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        assert main(arguments) == 0
+        console.say("nobody reads this")
+        console.finish_streams()
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+@pytest.mark.parametrize("arguments", [["--help"], ["models"]])
+def test_a_log_on_a_full_disk_is_one_sentence(monkeypatch, capfd, arguments):
+    with Path("/dev/full").open("w") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        assert main(arguments) == 1
+        console.finish_streams()
+    assert capfd.readouterr().err.count("\n") == 1
+
+
+def test_names_of_files_that_are_no_text_are_refused(freegeo, monkeypatch, tmp_path):
+    def write(*arguments):
+        (tmp_path / "x.json").write_text('{\n  "names": [\n    "\udcff1.png",\n    "2.png"]', encoding="utf-8")
+
+    monkeypatch.setattr("freegeo.cli.reconstruct.load_source", write)
+    outcome = freegeo("reconstruct", "x", "-o", tmp_path / "out")
+    assert outcome.code == 2
+    assert outcome.sentence() == "freegeo: \\udcff1.png: the name of a file is not UTF-8 text. Rename that file."
 
 
 # -- models
@@ -183,7 +321,8 @@ def test_models_fit_a_terminal_and_name_every_licence(freegeo):
     for name in catalog.names():
         (line,) = [line for line in lines if line.split()[:1] == [name]]
         assert catalog.entry(name).licence.split(" (")[0] in line
-    assert "not implemented yet" in outcome.out
+    for missing in ("da3mono-large", "da3metric-large", "da3nested-giant-large"):
+        assert missing not in outcome.out
 
 
 @pytest.mark.parametrize(
@@ -199,13 +338,32 @@ def test_describe_counts_what_an_adapter_trains(freegeo, name, counts):
         assert count in outcome.out
 
 
-def test_describe_says_what_is_not_there_yet(freegeo):
-    for name in catalog.names():
-        if catalog.entry(name).build is None:
-            outcome = freegeo("models", "describe", name)
-            assert outcome.code == 0
-            assert "not implemented yet" in outcome.out
-            assert freegeo("models", "check", name, "x.safetensors").code == 2
+def test_models_show_the_download_and_the_memory(freegeo):
+    lines = {line.split()[0]: line for line in freegeo("models").out.splitlines() if line.strip()}
+    assert "5.4 GB" in lines["da3-giant"] and "5.0 GB" in lines["vggt-1b"]
+    assert "included" in lines["freegeo-tiny"]
+    memory = {name: reconstruction_bytes(catalog.build_empty(name)) for name in ("da3-base", "da3-giant")}
+    assert memory["da3-base"] < memory["da3-giant"]
+    for name, size in memory.items():
+        assert f"{size / 1e9:.1f} GB" in lines[name]
+
+
+def test_describe_says_how_much_memory_is_needed(freegeo):
+    out = freegeo("models", "describe", "depth-anything/DA3-BASE").out
+    assert out.startswith("da3-base: ")
+    built = catalog.build_empty("da3-base")
+    fast, small = adaptation_bytes(built)
+    assert reconstruction_bytes(built) > 4 * 135_366_599
+    assert fast > small > 4 * 135_366_599
+    assert f"to adapt on a GPU {fast / 1e9:.1f} GB, or {small / 1e9:.1f} GB where that does not fit" in out
+
+
+@pytest.mark.parametrize("command", [("describe",), ("download",), ("check",)])
+def test_models_that_are_not_implemented_say_so(freegeo, weights, command):
+    outcome = freegeo("models", *command, "da3mono-large", *([weights] if command == ("check",) else []))
+    assert outcome.code == 2
+    assert "da3mono-large is not implemented" in outcome.sentence()
+    assert "use da3-small" in outcome.sentence()
 
 
 def test_check_tells_whether_a_file_fits(freegeo, weights):

@@ -141,7 +141,7 @@ def bad_checkpoint(kind: str, folder: Path, weights: Path) -> tuple[Path, tuple[
         return file, ("1 of another shape", "(3, 3, 3)")
     if kind == "pickle":
         file.write_bytes(pickle.dumps({"weight": [1.0]}))
-        return file, ("not a safetensors file (a renamed pickle?)",)
+        return file, ("not a safetensors file, a renamed pickle or damaged",)
     if kind == "code":
         trap = folder / "trap.pt"
         torch.save({"weight": Path("x")}, trap)
@@ -201,12 +201,13 @@ def test_output_that_cannot_be_written_to(freegeo, photo_folder, tiny, tmp_path,
     ("options", "words"),
     [
         (["--stepz", "3"], "Did you mean --steps?"),
-        (["--steps", "many"], 'unable to convert "many" into int'),
+        (["--steps", "many"], "--steps: 'many' is not a whole number"),
         (["--steps", "0"], "at least 1"),
         (["--views", "2"], "--views must be at least 3"),
         (["--keep", "0,x"], "Write it as 0,2,4,6"),
         (["--keep", "2,0"], "must ascend"),
-        (["--rank", "0"], "rank must be positive"),
+        (["--rank", "0"], "--rank must be positive"),
+        (["--sets", "0"], "--sets must be positive"),
         (["--precision", "fp99"], '"fp32", "bf16", "fp16"'),
         (["--device", "toaster"], "toaster"),
         (["--recipe", "paper"], "--dataset"),

@@ -1,7 +1,10 @@
 """Checkpoints load strictly, whatever their container; what does not fit or is damaged gives one clear sentence."""
 
-import logging
+import argparse
+import json
+import struct
 import sys
+from collections import OrderedDict
 from pathlib import Path
 from types import ModuleType
 
@@ -17,7 +20,7 @@ import parity_da3  # noqa: E402
 import parity_vggt  # noqa: E402
 from freegeo.errors import UserError  # noqa: E402
 from freegeo.models import catalog, da3_config, vggt_config  # noqa: E402
-from freegeo.models.checkpoints import find_file, save_weights  # noqa: E402
+from freegeo.models.checkpoints import find_file, fingerprint, read_header, require_fit, save_weights  # noqa: E402
 from freegeo.models.spec import ModelEntry  # noqa: E402
 
 DA3 = TESTS / "fixtures" / "da3" / "tiny-mlp"
@@ -70,9 +73,195 @@ def test_both_containers_load_to_the_same_frozen_model(tmp_path, name, folder, s
     assert model.loaded_from.licence == "none" and len(model.loaded_from.fingerprint) == 16
 
 
-def test_state_dict_under_the_name_model_is_found(tmp_path):
-    torch.save({"model": load_file(VGGT / "weights.safetensors"), "epoch": torch.tensor(3)}, tmp_path / "run.pt")
-    assert load("small-vggt", tmp_path / "run.pt").loaded_from.file == "run.pt"
+def is_loaded(name: str, folder: Path, path: Path) -> bool:
+    """Say whether a file gives the model of `folder`."""
+    state, wanted = load(name, path).state_dict(), load(name, folder / "weights.safetensors").state_dict()
+    return all(torch.equal(value, state[key]) for key, value in wanted.items())
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        lambda state: {"model": state, "epoch": torch.tensor(3)},
+        lambda state: {"state_dict": state, "epoch": 3, "optimizer_states": [{"state": {}}]},
+        lambda state: {"model_state_dict": state},
+        lambda state: {"module": state, "lr_scheduler": None},
+        lambda state: {"model": state, "args": argparse.Namespace(lr=1.0, name="run")},
+        lambda state: {"state_dict": {"model": state}},
+        lambda state: {"state_dict": {f"model.{name}": value for name, value in state.items()}},
+        lambda state: OrderedDict(state),
+    ],
+)
+def test_weights_in_a_training_checkpoint_are_found(tmp_path, content):
+    torch.save(content(load_file(VGGT / "weights.safetensors")), tmp_path / "run.pt")
+    assert is_loaded("small-vggt", VGGT, tmp_path / "run.pt")
+
+
+def test_other_weights_in_the_file_are_mentioned(tmp_path, caplog):
+    state = load_file(VGGT / "weights.safetensors")
+    torch.save({"ema": {name: value * 2 for name, value in state.items()}, "model": state}, tmp_path / "run.pt")
+    assert is_loaded("small-vggt", VGGT, tmp_path / "run.pt")
+    assert "the weights under 'model' are used; the file also holds 'ema'" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        "module.{}", "_orig_mod.{}", "_orig_mod.module.{}", "module.model.{}", "model._fsdp_wrapped_module.{}",
+        "system.network.{}",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize(("name", "folder"), [("small-da3", DA3), ("small-vggt", VGGT)])
+def test_names_of_a_wrapped_model_are_unwrapped(tmp_path, name, folder, wrapped):
+    tensors = {wrapped.format(k): v for k, v in load_file(folder / "weights.safetensors").items()}
+    assert is_loaded(name, folder, save(tmp_path / "m.safetensors", tensors))
+
+
+def test_a_wrapper_inside_the_model_is_taken_out(tmp_path):
+    tensors = load_file(DA3 / "weights.safetensors")
+    inside = {name.replace("pretrained.", "pretrained._orig_mod."): value for name, value in tensors.items()}
+    assert inside.keys() != tensors.keys()
+    assert is_loaded("small-da3", DA3, save(tmp_path / "m.safetensors", inside))
+
+
+def test_tensors_beside_a_wrapped_model_are_refused_by_name(tmp_path):
+    tensors = {f"student.{name}": value for name, value in load_file(VGGT / "weights.safetensors").items()}
+    path = save(tmp_path / "m.safetensors", {**tensors, "loss.weight": torch.ones(2)})
+    with pytest.raises(UserError, match=r"fit small-vggt: 1 unexpected \(first: loss\.weight\)\."):
+        load("small-vggt", path)
+
+
+def test_a_tensor_that_is_there_twice_is_refused(tmp_path):
+    tensors = load_file(VGGT / "weights.safetensors")
+    first = next(iter(tensors))
+    path = save(tmp_path / "m.safetensors", {**tensors, f"module.{first}": tensors[first] * 2})
+    with pytest.raises(UserError, match=f"holds {first} twice, as .*{first} and as"):
+        load("small-vggt", path)
+
+
+@pytest.mark.parametrize("suffix", [".pt", ".pth", ".bin", ".ckpt"])
+@pytest.mark.parametrize("in_zip", [True, False])
+def test_pickles_old_and_new_load_under_every_usual_name(tmp_path, suffix, in_zip):
+    path = tmp_path / f"weights{suffix}"
+    torch.save(load_file(VGGT / "weights.safetensors"), path, _use_new_zipfile_serialization=in_zip)
+    assert is_loaded("small-vggt", VGGT, path)
+
+
+def sharded(folder: Path, ending: str) -> Path:
+    """Write the small VGGT in two parts with an index; returns the index."""
+    folder.mkdir()
+    tensors = load_file(VGGT / "weights.safetensors")
+    stem = "model" if ending == ".safetensors" else "pytorch_model"
+    place = {name: f"{stem}-0000{1 + k % 2}-of-00002{ending}" for k, name in enumerate(tensors)}
+    for file in set(place.values()):
+        part = {name: value for name, value in tensors.items() if place[name] == file}
+        save_file(part, folder / file) if ending == ".safetensors" else torch.save(part, folder / file)
+    index = folder / f"{stem}{ending}.index.json"
+    index.write_text(json.dumps({"metadata": {}, "weight_map": place}))
+    return index
+
+
+@pytest.mark.parametrize("ending", [".safetensors", ".bin"])
+def test_a_checkpoint_in_parts_loads_from_its_folder_its_index_and_any_part(tmp_path, ending):
+    index = sharded(tmp_path / "parts", ending)
+    for given in (index.parent, index, next(index.parent.glob("*-00002-of-00002.*"))):
+        assert find_file(given) == index
+    assert is_loaded("small-vggt", VGGT, index.parent)
+    require_fit(catalog.build_empty("small-vggt"), index, vggt_config.KEYS, "small-vggt")
+
+
+def test_parts_have_a_fingerprint_together(tmp_path):
+    index = sharded(tmp_path / "parts", ".safetensors")
+    before = fingerprint(index)
+    assert before == fingerprint(sharded(tmp_path / "again", ".safetensors"))
+    part = next(index.parent.glob("*-00002-of-00002.*"))
+    save_file({name: value + 1 for name, value in load_file(part).items()}, part)
+    assert fingerprint(index) != before
+
+
+def test_parts_that_are_missing_are_named(tmp_path):
+    index = sharded(tmp_path / "parts", ".safetensors")
+    first, second = sorted(index.parent.glob("*.safetensors"))
+    tensors = load_file(second)
+    moved = tensors.pop(next(iter(tensors)))
+    save_file(tensors, second)
+    with pytest.raises(UserError, match=r"00002-of-00002\.safetensors: 1 tensors of .*index\.json are missing"):
+        load("small-vggt", index.parent)
+    with pytest.raises(UserError, match="1 missing"):
+        require_fit(catalog.build_empty("small-vggt"), index, vggt_config.KEYS, "small-vggt")
+    save_file({**tensors, "surplus": moved}, second)
+    second.unlink()
+    with pytest.raises(UserError, match=r"00002-of-00002\.safetensors: this part of the checkpoint is missing"):
+        load("small-vggt", index)
+    index.write_text("[]")
+    with pytest.raises(UserError, match="not the index of a checkpoint"):
+        load("small-vggt", index)
+    index.unlink()
+    for given in (first, first.parent):
+        with pytest.raises(UserError, match=r"whose index model\.safetensors\.index\.json is missing"):
+            load("small-vggt", given)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
+def test_weights_of_other_precisions_are_converted(tmp_path, dtype):
+    tensors = {name: value.to(dtype) for name, value in load_file(VGGT / "weights.safetensors").items()}
+    path = save(tmp_path / "m.safetensors", tensors)
+    assert all(value.dtype == torch.float32 for value in load("small-vggt", path).state_dict().values())
+    require_fit(catalog.build_empty("small-vggt"), path, vggt_config.KEYS, "small-vggt")
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
+@pytest.mark.parametrize("dtype", [torch.float8_e4m3fn, torch.float8_e5m2, torch.int8, torch.uint8])
+def test_weights_that_need_scales_are_refused(tmp_path, dtype, suffix):
+    tensors = load_file(VGGT / "weights.safetensors")
+    tensors = {name: value.to(dtype) if value.ndim > 1 else value for name, value in tensors.items()}
+    path = save(tmp_path / f"m{suffix}", tensors)
+    with pytest.raises(UserError, match="which needs scales that freegeo does not read") as error:
+        load("small-vggt", path)
+    assert one_sentence_about(error, str(path), str(dtype).removeprefix("torch."), "Use weights in float32")
+    with pytest.raises(UserError, match="which needs scales"):
+        require_fit(catalog.build_empty("small-vggt"), path, vggt_config.KEYS, "small-vggt")
+
+
+def header_of(text: str) -> bytes:
+    return struct.pack("<Q", len(text.encode())) + text.encode() + bytes(40)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"", b"abc", struct.pack("<Q", 1 << 40) + bytes(40), struct.pack("<Q", 4) + b"\xff\xfe{}", header_of("[1]"),
+        header_of('{"a": 1}'), header_of('{"a": {"dtype": "F32", "shape": [10]}}'),
+        header_of('{"a": {"dtype": "X32", "shape": [10], "data_offsets": [0, 40]}}'),
+        header_of('{"a": {"dtype": "F32", "shape": [-10], "data_offsets": [0, 40]}}'),
+        header_of('{"a": {"dtype": "F32", "shape": [9], "data_offsets": [0, 40]}}'),
+        header_of('{"a": {"dtype": "F32", "shape": [10], "data_offsets": [8, 48]}}'),
+    ],
+)  # fmt: skip
+def test_damaged_headers_are_refused(tmp_path, content):
+    path = tmp_path / "m.safetensors"
+    path.write_bytes(content)
+    for read in (lambda: load("small-vggt", path), lambda: read_header(path)):
+        with pytest.raises(UserError) as error:
+            read()
+        assert one_sentence_about(error, str(path), "ownload")
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 5\n", "a pointer of Git LFS"),
+        (b"<!DOCTYPE html><html>Log in</html>", "a web page, not weights"),
+        (b"not weights at all, but some words", "not a "),
+    ],
+)
+def test_text_in_the_place_of_weights_is_named(tmp_path, suffix, content, words):
+    path = tmp_path / f"model{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=words) as error:
+        load("small-vggt", path)
+    assert one_sentence_about(error, str(path))
 
 
 @pytest.mark.parametrize(
@@ -152,7 +341,7 @@ def test_pickles_are_never_executed(tmp_path, monkeypatch):
     torch.save({"weight": torch.ones(2), "more": Surprise()}, "model.pt")
     with pytest.raises(UserError, match="never runs code") as error:
         load("small-vggt", tmp_path / "model.pt")
-    assert one_sentence_about(error, "model.pt", ".safetensors download")
+    assert one_sentence_about(error, "model.pt", "getattr", ".safetensors download")
     assert not Path("unpickled").exists()
 
 
@@ -196,11 +385,33 @@ def test_a_family_of_models_is_added_by_naming_its_module(monkeypatch):
     assert isinstance(catalog.build_empty("new"), nn.Identity)
 
 
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("depth-anything/DA3-BASE", "da3-base"),
+        ("depth-anything/da3-giant-1.1", "da3-giant"),
+        ("https://huggingface.co/facebook/VGGT-1B", "vggt-1b"),
+        ("DA3-Small", "da3-small"),
+        ("depth-anything/DA3MONO-LARGE", "da3mono-large"),
+    ],
+)
+def test_models_are_found_by_their_id_on_the_hub(name, found):
+    assert catalog.entry(name).name == found
+
+
+def test_a_model_that_is_given_by_another_name_has_its_own(tmp_path):
+    embedded = catalog.load_model("FreeGeo-Tiny")
+    assert embedded.loaded_from.model == embedded.spec.name == "freegeo-tiny"
+
+
 def test_unknown_names_list_the_known_ones():
     with pytest.raises(UserError, match=r"unknown model 'vgt'.*da3-base.*vggt-1b, vggt-1b-commercial"):
         catalog.load_model("vgt")
-    with pytest.raises(UserError, match="not implemented yet"):
+    with pytest.raises(UserError, match=r"da3mono-large is not implemented: .*use da3-small"):
         catalog.load_model("da3mono-large")
+    with pytest.raises(UserError, match="unknown model 'someone/DA3-BASE'") as error:
+        catalog.load_model("someone/DA3-BASE")
+    assert "mono" not in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -229,56 +440,6 @@ def test_totals_are_the_published_ones():
         "vggt-1b": 1_256_537_516,
     }
     assert {name: catalog.entry(name).parameters for name in published} == published
-
-
-@pytest.fixture
-def hub(monkeypatch):
-    """The hub library without a network or a cache: what it was asked for, and whether the hub answers."""
-    import huggingface_hub
-    from huggingface_hub.errors import LocalEntryNotFoundError
-
-    class Hub:
-        answers, cached, asked = True, None, []
-
-    def metadata(url, *, timeout):
-        assert timeout <= 10
-        if not Hub.answers:
-            logging.getLogger("huggingface_hub.utils").warning("noise")
-            huggingface_hub.get_session().get("nowhere://hub")  # fails with the error of whichever client it is
-
-    def download(*where):
-        Hub.asked = [*Hub.asked, where]
-        raise LocalEntryNotFoundError("offline")
-
-    monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", lambda *where: Hub.cached)
-    monkeypatch.setattr(huggingface_hub, "get_hf_file_metadata", metadata)
-    monkeypatch.setattr(huggingface_hub, "hf_hub_download", download)
-    return Hub
-
-
-def test_failed_download_says_what_to_do(hub):
-    with pytest.raises(UserError, match=r"Go online and run `freegeo models download vggt-1b`"):
-        catalog.load_model("vggt-1b")
-    with pytest.raises(UserError, match=r"Accept its licence at https://huggingface\.co/facebook/VGGT-1B-Commercial"):
-        catalog.load_model("vggt-1b-commercial")
-    assert hub.asked == [
-        ("facebook/VGGT-1B", "model.safetensors"),
-        ("facebook/VGGT-1B-Commercial", "vggt_1B_commercial.pt"),
-    ]
-
-
-def test_unreachable_hub_is_noticed_before_the_download_and_without_noise(hub, caplog):
-    hub.answers = False
-    with pytest.raises(UserError, match="could not be downloaded"):
-        catalog.download("da3-small")
-    assert hub.asked == []
-    assert "noise" not in caplog.text
-    assert logging.getLogger("huggingface_hub").level != logging.CRITICAL
-
-
-def test_downloaded_checkpoint_needs_no_network(hub):
-    hub.answers, hub.cached = False, "/cache/model.safetensors"
-    assert catalog.download("da3-small").as_posix() == "/cache/model.safetensors"
 
 
 @pytest.mark.parametrize(("name", "folder"), [("small-da3", DA3), ("small-vggt", VGGT)])

@@ -15,6 +15,7 @@ FOLDER/   <name>_lora_peft/           peft's two files; layers are named relativ
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ from torch import Tensor
 from freegeo.adaptation.adapter import Adapter
 from freegeo.errors import UserError
 from freegeo.files import FORMAT, atomic_path, read_json, write_json, write_tensors
-from freegeo.models.checkpoints import read_tensors, require_match
+from freegeo.models.checkpoints import read_tensors, require_match, require_sound
 
 if TYPE_CHECKING:
     from freegeo.models.api import ReconstructionModel
@@ -33,13 +34,20 @@ if TYPE_CHECKING:
 TOKEN, METADATA = "camera_token.safetensors", "freegeo.json"
 PEFT_PREFIX = "base_model.model."
 CONFIG, WEIGHTS = "adapter_config.json", "adapter_model.safetensors"
-CHANGES_THE_FORMULA = (
-    *("use_rslora", "use_dora", "rank_pattern", "alpha_pattern", "modules_to_save"),
-    *("fan_in_fan_out", "layer_replication"),
+ADAPTER_FOLDER = "adapter"
+"""Where the output folder of a run keeps its adapter."""
+WITHOUT_EFFECT = (
+    *("peft_type", "task_type", "auto_mapping", "peft_version", "base_model_name_or_path", "revision"),
+    *("inference_mode", "r", "lora_alpha", "lora_dropout", "target_modules", "exclude_modules", "layers_to_transform"),
+    *("layers_pattern", "megatron_core", "qalora_group_size", "runtime_config", "ensure_weight_tying"),
+    *("loftq_config", "eva_config", "corda_config", "lora_ga_config"),
 )
-"""Settings of peft under which an adapter is more than W + alpha / r * B A with one rank."""
+"""Settings of peft under which a saved adapter is W + alpha / r * B A, whatever their value; the rest must be off."""
+STARTS_ON_THE_MODEL = (True, False, None, "gaussian", "orthogonal", "eva", "mica")
+"""Initialisations of peft that leave the weights of the model as they are."""
 
 
+PLAIN_BIAS = ("bias", "none")
 LORA_SUFFIX, TOKEN_SUFFIX = "_lora_peft", "_lora.pt"
 
 
@@ -60,11 +68,11 @@ def save_adapter(adapter: Adapter, folder: Path, metadata: Mapping[str, Any]) ->
 def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
     """Attach a saved adapter, on and at strength 1, for inference; the model is unchanged when this fails.
 
-    Reads our own folders, plain peft folders and the authors' published layout. UserError when the folder is no
-    adapter, or when it was made for another model (by layer names and shapes; a differing fingerprint of the same
-    architecture is an error too).
+    Reads our own folders, plain peft folders and the authors' published layout (`find_adapter` says where). UserError
+    when the folder is no adapter, when its numbers are not finite, or when it was made for another model (by layer
+    names and shapes; a differing fingerprint of the same architecture is an error too).
     """
-    folder, model = Path(folder), model.adaptable()
+    folder, model = find_adapter(folder), model.adaptable()
     config, tensors = read_peft(folder)
     _require_same_base(model, adapter_metadata(folder), folder)
     tensors = own_names(model, tensors) | _camera_token(model, folder)
@@ -81,7 +89,9 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
         ours.pop("camera_token", None)
     try:
         shapes = {name: tuple(value.shape) for name, value in tensors.items()}
-        require_match(ours, shapes, f"{folder}: this adapter does not fit {model.spec.name}")
+        require_match(
+            ours, shapes, f"{folder}: this adapter does not fit {model.spec.name}", "Check --model and --adapter."
+        )
         adapter.load(tensors)
     except UserError:
         adapter.detach()
@@ -91,14 +101,48 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
     return adapter
 
 
+def find_adapter(path: str | Path) -> Path:
+    """Return the folder that holds an adapter's files.
+
+    `path` is that folder, one of the two files in it, the output folder of a run, or a folder with one published
+    adapter; `~` is the user's home. A path without an adapter comes back as it is, for `read_peft` to refuse. UserError
+    when there are several adapters to choose from.
+    """
+    folder = Path(path).expanduser()
+    if folder.name in (CONFIG, WEIGHTS) and folder.is_file():
+        return folder.parent
+    if (folder / CONFIG).is_file():
+        return folder
+    if (folder / ADAPTER_FOLDER / CONFIG).is_file():
+        return folder / ADAPTER_FOLDER
+    published = sorted(file.parent for file in folder.glob(f"*{LORA_SUFFIX}/{CONFIG}"))
+    if len(published) > 1:
+        raise UserError(f"{folder}: holds several adapters ({', '.join(p.name for p in published)}). Name one of them.")
+    return published[0] if published else folder
+
+
 def adapter_metadata(folder: Path) -> dict[str, Any] | None:
     """Return freegeo.json of an adapter folder; None for an adapter that freegeo did not write."""
-    return read_json(folder / METADATA) if (folder / METADATA).is_file() else None
+    path = folder / METADATA
+    if not path.is_file():
+        return None
+    metadata = read_json(path)
+    base = metadata.get("base") if isinstance(metadata, dict) else None
+    if not isinstance(base, dict) or not {"model", "fingerprint"} <= base.keys() or "format" not in metadata:
+        raise UserError(f"{path}: does not describe an adapter. Copy the whole folder that `freegeo adapt` wrote.")
+    if metadata["format"] > FORMAT:
+        raise UserError(f"{folder}: written by a newer freegeo (format {metadata['format']}). Update freegeo.")
+    return metadata
 
 
 def _camera_token(model: ReconstructionModel, folder: Path) -> dict[str, Tensor]:
-    if (folder / TOKEN).is_file():
-        return read_tensors(folder / TOKEN)
+    path = folder / TOKEN
+    if path.is_file():
+        tensors = read_tensors(path)
+        require_sound(tensors, path)
+        return tensors
+    if (folder / METADATA).is_file() and model.camera_token_name is not None:
+        raise UserError(f"{path}: this file of the adapter is missing. Copy the whole folder that freegeo wrote.")
     # A plain peft adapter has no camera token; the authors' always has one.
     if is_published(folder) and model.camera_token_name is not None:
         return {"camera_token": read_camera_token(folder)}
@@ -117,8 +161,6 @@ def _base(model: ReconstructionModel) -> dict[str, str]:
 def _require_same_base(model: ReconstructionModel, metadata: Mapping[str, Any] | None, folder: Path) -> None:
     if metadata is None:
         return
-    if metadata["format"] > FORMAT:
-        raise UserError(f"{folder}: written by a newer freegeo (format {metadata['format']}). Update freegeo.")
     base, mine = metadata["base"], _base(model)
     if base["model"] != mine["model"]:
         raise UserError(f"{folder}: the adapter was made for {base['model']}, not for {mine['model']}. Use that model.")
@@ -147,23 +189,41 @@ def write_peft(adapter: Adapter, folder: Path, *, root: str = "") -> list[Path]:
 def read_peft(folder: Path) -> tuple[Mapping[str, Any], dict[str, Tensor]]:
     """Return an adapter's configuration and its tensors `<layer>.lora_{A|B}.weight`.
 
-    UserError when the folder holds no LoRA adapter, or one with settings beyond plain LoRA.
+    UserError when the folder holds no LoRA adapter, one with settings beyond plain LoRA, or one with NaN or infinity.
     """
     if not (folder / CONFIG).is_file() or not (folder / WEIGHTS).is_file():
         raise UserError(
             f"{folder}: not an adapter folder ({CONFIG} and {WEIGHTS} are expected). "
-            "Give the folder that `freegeo adapt` wrote."
+            "Give the folder that `freegeo adapt` wrote, or the output folder of `freegeo run`."
         )
     config = read_json(folder / CONFIG)
-    if config.get("peft_type") != "LORA" or not {"r", "lora_alpha"} <= set(config):
-        raise UserError(f"{folder}: holds a {config.get('peft_type')} adapter; only LoRA is supported.")
-    special = [name for name in CHANGES_THE_FORMULA if config.get(name)]
-    if special:
-        raise UserError(f"{folder}: the adapter uses {', '.join(special)}; only plain LoRA of one rank is supported.")
-    tensors = {name.removeprefix(PEFT_PREFIX): value for name, value in read_tensors(folder / WEIGHTS).items()}
+    _require_plain_lora(config, folder)
+    tensors = read_tensors(folder / WEIGHTS)
+    require_sound(tensors, folder / WEIGHTS)
+    tensors = {name.removeprefix(PEFT_PREFIX): value for name, value in tensors.items()}
     if not lora_layers(tensors):
         raise UserError(f"{folder / WEIGHTS}: no LoRA matrices in it. Give the folder that `freegeo adapt` wrote.")
     return config, tensors
+
+
+def _require_plain_lora(config: Any, folder: Path) -> None:
+    if not isinstance(config, dict) or config.get("peft_type") != "LORA":
+        kind = config.get("peft_type", "different") if isinstance(config, dict) else "different"
+        raise UserError(f"{folder}: holds a {kind} adapter; only LoRA is supported.")
+    rank, alpha = config.get("r"), config.get("lora_alpha")
+    if type(rank) is not int or rank < 1 or type(alpha) not in (int, float) or not math.isfinite(alpha):
+        raise UserError(f"{folder / CONFIG}: rank {rank} and alpha {alpha} are not those of an adapter. Copy it again.")
+    start = config.get("init_lora_weights")
+    if start not in STARTS_ON_THE_MODEL:
+        raise UserError(
+            f"{folder}: the adapter was initialised by {start}, which changes the weights of the model itself; only "
+            "LoRA on the unchanged model is supported. Convert it with peft (save_pretrained with "
+            "path_initial_model_for_weight_conversion)."
+        )
+    known = {*WITHOUT_EFFECT, "init_lora_weights"}
+    special = [name for name, value in config.items() if value and name not in known and (name, value) != PLAIN_BIAS]
+    if special:
+        raise UserError(f"{folder}: the adapter uses {', '.join(special)}; only plain LoRA of one rank is supported.")
 
 
 def lora_layers(tensors: Mapping[str, Tensor]) -> list[str]:
@@ -203,6 +263,7 @@ def read_camera_token(folder: Path) -> Tensor:
     tensors = read_tensors(path)
     if set(tensors) != {"camera_token"}:
         raise UserError(f"{path}: expected only camera_token, found {', '.join(sorted(tensors)) or 'nothing'}.")
+    require_sound(tensors, path)
     return tensors["camera_token"]
 
 

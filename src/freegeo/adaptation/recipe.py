@@ -176,9 +176,10 @@ class Recipe:
                 raise UserError(f"--keep must name at least 2 and fewer than {self.views} of the views.")
         if self.hold < 0:
             raise UserError(f"--hold must be 0 or more, got {self.hold}.")
-        for name in ("lr", "rank", "alpha", "batch", "sets_per_scene"):
+        options = {"lr": "--lr", "rank": "--rank", "sets_per_scene": "--sets", "alpha": "alpha", "batch": "batch"}
+        for name, shown in options.items():
             if not getattr(self, name) > 0:
-                raise UserError(f"recipe setting {name} must be positive, got {getattr(self, name)}.")
+                raise UserError(f"{shown} must be positive, got {getattr(self, name)}.")
         if (self.steps is None) == (self.epochs is None) or (self.steps or self.epochs or 0) < 1:
             raise UserError("a recipe needs either --steps or --epochs, not both, and at least 1.")
 

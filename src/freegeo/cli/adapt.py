@@ -52,6 +52,7 @@ def adapt(
     empty = model.build_empty()
     plan = recipe.build(empty.spec)
     scenes = {str(part[0]): load_source(part, photos) for part in split_scenes(sources)}
+    model.warn_of_embedded(sources)
     for found in scenes.values():
         require_enough_photos(found)
     batches = {name: empty.preprocess(found) for name, found in scenes.items()}

@@ -9,6 +9,7 @@ from cyclopts import App, Parameter
 
 from freegeo.cli import console
 from freegeo.cli.jobs import adapter_identity
+from freegeo.cli.options import model_of_adapter
 from freegeo.errors import UserError
 
 app = App(name="adapter", help="Fold a saved adapter into the weights of its model.", help_format="plaintext")
@@ -32,13 +33,13 @@ def merge(
     Parameters
     ----------
     adapter
-        Folder of a saved adapter.
+        Folder of a saved adapter, or the output folder of a run.
     output
         The weight file, FILE.safetensors.
     strength
         0 is the frozen model, 1 the adapted one, and between them the weights are interpolated.
     model
-        Catalog name; default: the model that the adapter was made for.
+        Name or hub id of the model; default: the one that the adapter was made for.
     checkpoint
         Local weight file or folder of the model, instead of the download.
     overwrite
@@ -48,15 +49,13 @@ def merge(
         raise UserError(f"{output}: merged weights are written as {SUFFIX}. Choose such a name.")
     if output.exists() and not overwrite:
         raise UserError(f"{output}: exists already. Add --overwrite to replace it, or choose another name.")
-    identity = adapter_identity(adapter)
-    from freegeo.adaptation.adapter_files import adapter_metadata, load_adapter
+    from freegeo.adaptation.adapter_files import find_adapter, load_adapter
     from freegeo.models import catalog
     from freegeo.models.checkpoints import fingerprint, save_weights
 
-    metadata = adapter_metadata(adapter)
-    name = model or (metadata["base"]["model"] if metadata else None)
-    if name is None:
-        raise UserError(f"{adapter}: does not say which model it was made for. Name that with --model.")
+    adapter = find_adapter(adapter)
+    name = model_of_adapter(adapter, model)
+    identity = adapter_identity(adapter)
     loaded = catalog.load_model(name, checkpoint=checkpoint)
     folded = load_adapter(loaded, adapter)
     folded.set_strength(strength)

@@ -1,10 +1,13 @@
 """The program `freegeo`: commands load on use, so that help needs no torch.
 
 `--config FILE.toml` sets options that the command line leaves out. The file has one table per command, named like it,
-with the long names of the options without their dashes; a switch is true or false:
+with the long names of the options without their dashes, and the arguments by their name; a switch is true or false:
 
     [run]
+    sources = ["photos"]
+    output = "out"
     model = "da3-giant"
+    formats = ["ply", "mesh"]
     steps = 50
     adapt = true
 """
@@ -17,7 +20,7 @@ import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from freegeo import __version__
 from freegeo.cli import console
@@ -56,12 +59,14 @@ def build(config: Path | None = None) -> App:
     """Build the command tree; `config` is a TOML file with one table per command."""
     import cyclopts
 
+    from freegeo.cli.parsing import readers
+
     app = cyclopts.App(
         name="freegeo",
         help=ABOUT,
         version=__version__,
         help_epilogue=GLOBAL,
-        config=None if config is None else cyclopts.config.Dict(read_config(config), source=str(config)),
+        config=readers(config),
         help_format="plaintext",
         result_action="return_value",
         suppress_keyboard_interrupt=False,
@@ -77,14 +82,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0: done; 2: the user's mistake; 1: a failure; 3: everything was written but for some files; 130: Ctrl-C.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    console.prepare_streams()
     # The parser takes longer to load than these two take to answer.
-    if arguments in ([], ["-h"], ["--help"]):
-        console.say(overview())
-        return 0
-    if arguments == ["--version"]:
-        console.say(__version__)
-        return 0
-    return run_command(arguments)
+    answers = {"": overview, "-h": overview, "--help": overview, "--version": lambda: __version__}
+    if len(arguments) > 1 or "".join(arguments) not in answers:
+        return run_command(arguments)
+    try:
+        console.say(answers["".join(arguments)]())
+    except OSError as error:
+        return _fail_to_write(error)
+    return 0
 
 
 def run_command(arguments: Sequence[str]) -> int:
@@ -97,7 +104,9 @@ def run_command(arguments: Sequence[str]) -> int:
         console.configure_logging(verbose)
         build(config)(rest, exit_on_error=False, print_error=False)
     except cyclopts.CycloptsError as error:
-        return console.fail(one_line(str(error)), USER_MISTAKE)
+        from freegeo.cli.parsing import explain
+
+        return console.fail(explain(error), USER_MISTAKE)
     except UserError as error:
         return console.fail(str(error), USER_MISTAKE)
     except PartialResultError as error:
@@ -107,9 +116,17 @@ def run_command(arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         return console.fail("interrupted; the same command continues an unfinished run.", INTERRUPTED)
     except OSError as error:
-        hint = " Make room and run the same command again; it continues." if error.errno == errno.ENOSPC else ""
-        return console.fail(f"{error.filename or 'input or output'}: {error.strerror or error}.{hint}", FAILURE)
+        return _fail_to_write(error)
+    except UnicodeEncodeError as error:
+        # Names of files may hold any bytes; no file that we write can.
+        name = error.object[error.object.rfind("\n", 0, error.start) + 1 :].partition("\n")[0].strip(' ",')
+        return console.fail(f"{name}: the name of a file is not UTF-8 text. Rename that file.", USER_MISTAKE)
     return 0
+
+
+def _fail_to_write(error: OSError) -> int:
+    hint = " Make room and run the same command again; it continues." if error.errno == errno.ENOSPC else ""
+    return console.fail(f"{error.filename or 'input or output'}: {error.strerror or error}.{hint}", FAILURE)
 
 
 def split_global(arguments: Sequence[str]) -> tuple[list[str], Path | None, bool]:
@@ -137,16 +154,6 @@ def expand_home(token: str) -> str:
     return os.path.expanduser(token)  # noqa: PTH111
 
 
-def read_config(path: Path) -> dict[str, Any]:
-    """Return the tables of a checked config file, with the home folder for `~`."""
-    with path.open("rb") as file:
-        tables = tomllib.load(file)
-    return {
-        name: {key: os.path.expanduser(value) if isinstance(value, str) else value for key, value in table.items()}  # noqa: PTH111
-        for name, table in tables.items()
-    }
-
-
 def checked_config(path: Path) -> Path:
     """Return the path of a config file; UserError unless it is TOML with tables named like commands.
 
@@ -169,16 +176,10 @@ def checked_config(path: Path) -> Path:
     return path
 
 
-def one_line(text: str) -> str:
-    """Join a parser's message into one sentence."""
-    return " ".join(text.split())
-
-
 def entry() -> None:
     """Console script: exit with the command's code."""
     code = main()
-    sys.stdout.flush()
-    sys.stderr.flush()
+    console.finish_streams()
     # Worker threads of third-party libraries must not hold the process after everything is written.
     os._exit(code) if code == INTERRUPTED else sys.exit(code)
 

@@ -63,7 +63,7 @@ class BenchModel(ModelOptions):
     """Which model is scored."""
 
     model: str = EMBEDDED_MODEL
-    """Catalog name (`freegeo models`) or a plug-in's."""
+    """Name (`freegeo models`) or hub id of a model, or a plug-in's name."""
     seed: Annotated[int, Parameter(name="--adapt-seed")] = PAPER_SEED
     """Seed of the adaptation; the frames have seeds of their own (--seeds)."""
     reference: Annotated[None, Parameter(parse=False)] = None
@@ -80,7 +80,7 @@ class BenchRecipe(RecipeOptions):
     dataset: Annotated[None, Parameter(parse=False)] = None
     """Not an option here: every dataset has its own settings."""
     views: Annotated[int | None, Parameter(name="--teacher-views")] = None
-    """Views the teacher sees while adapting (8); --views are those that are scored."""
+    """Photos in one training example of the adaptation; --views are those that are scored. Default: 8."""
 
 
 @Parameter(name="*")
@@ -238,7 +238,7 @@ def _prepare(
     limit = bench.scenes or (QUICK_SCENES if bench.quick else None)
     seeds = _numbers(bench.seeds, "--seeds")
     scenes = {name: listed_scenes(bench.data, name, limit) for name in names}
-    rule = _rule(bench, model.model)
+    rule = _rule(bench, model.name)
     tasks = [
         task
         for entry in entries
@@ -253,7 +253,7 @@ def _prepare(
         changes["steps"] = QUICK_STEPS
     predictor = Predictor(
         Setup(
-            data=bench.data, out=bench.output, model=model.model, checkpoint=model.checkpoint, device=model.device,
+            data=bench.data, out=bench.output, model=model.name, checkpoint=model.checkpoint, device=model.device,
             precision=model.precision, recipe=recipe.recipe, changes=changes, adapt_per=options.adapt_per,
             adapt_seed=model.seed, epoch=options.epoch, given_cameras=options.given_cameras, scenes=scenes,
             overwrite=options.overwrite,

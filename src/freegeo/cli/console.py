@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import logging
+import os
 import shlex
 import sys
 import textwrap
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import TextIO
 
 _typed: list[str] = []
 _warned: list[str] = []
@@ -74,14 +78,44 @@ def command_line() -> str:
     return shlex.join(_typed)
 
 
+def prepare_streams() -> None:
+    """Make stdout and stderr take any text: letters that their encoding lacks are escaped, and a closed one is mute."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 (for the whole process)
+        elif hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def finish_streams() -> None:
+    """Write out what stdout and stderr hold back; what cannot be written is dropped, without a traceback at the end."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):
+            _write("", stream)
+
+
 def say(text: str = "") -> None:
     """Print a line of a command's result."""
-    print(text, flush=True)
+    _write(f"{text}\n", sys.stdout)
 
 
 def note(text: str) -> None:
     """Print a line about the progress of a command to stderr."""
-    print(text, file=sys.stderr, flush=True)
+    _write(f"{text}\n", sys.stderr)
+
+
+def _write(text: str, stream: TextIO) -> None:
+    """Write and flush; a reader that went away (`| head`) does not stop the work of the command."""
+    try:
+        stream.write(text)
+        stream.flush()
+    except OSError as error:
+        # Nothing is tried again when the process ends.
+        with contextlib.suppress(OSError), Path(os.devnull).open("w") as nowhere:
+            os.dup2(nowhere.fileno(), stream.fileno())
+        if error.errno not in (errno.EPIPE, errno.EINVAL):  # the second on Windows
+            raise
 
 
 def fail(sentence: str, code: int) -> int:

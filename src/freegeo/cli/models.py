@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
@@ -11,55 +11,101 @@ from freegeo.cli import console
 from freegeo.models import catalog
 from freegeo.progress import progress_bar
 
+if TYPE_CHECKING:
+    from freegeo.models.api import ReconstructionModel
+    from freegeo.models.spec import ModelEntry
+
 app = App(name="models", help="List, describe, download and check models.", help_format="plaintext")
 TABLE_WIDTH = 100
 RANKS = (8, 16, 32, 64)
+VIEWS = 8
 
 
 @app.default
 def list_models() -> None:
-    """List all models."""
-    rows = [_row(name) for name in catalog.names()]
-    console.say(console.table(("model", "parameters", "licence", "about"), rows, prose=TABLE_WIDTH))
-    console.say("\nLicences are those of the weights. `freegeo models describe NAME` says more about one model.")
+    """List all models that can be used."""
+    header = ("model", "licence", "download", "memory", "about")
+    console.say(console.table(header, [_row(name) for name in catalog.names()], prose=TABLE_WIDTH))
+    console.say("\nLicences are those of the weights; memory is what reconstructing 8 photos takes.")
+    console.say("`freegeo models describe NAME` says more about one model.")
 
 
-def _row(name: str) -> tuple[str, str, str, str]:
+def _row(name: str) -> tuple[str, str, str, str, str]:
     item = catalog.entry(name)
     # Details follow after a bracket in licences and after a semicolon in descriptions.
     licence, about = item.licence.partition(" (")[0], item.about.partition(";")[0]
-    parameters = item.parameters or parameter_count(name)
-    return name, f"{parameters / 1e6:,.1f} M", licence, about if item.build else f"not implemented yet: {about}"
+    return name, licence, _download(item), _gigabytes(reconstruction_bytes(catalog.build_empty(name))), about
 
 
-def parameter_count(name: str) -> int:
-    """Count the parameters of a model built without memory."""
-    return sum(parameter.numel() for parameter in catalog.build_empty(name).parameters())
+def _download(item: ModelEntry) -> str:
+    if item.hub_id is not None:
+        return _gigabytes(item.download_bytes)
+    return "included" if item.packaged_weights else "none"
+
+
+def _gigabytes(size: float) -> str:
+    return f"{size / 1e9:.1f} GB" if size >= 5e7 else "< 0.1 GB"
+
+
+def reconstruction_bytes(model: ReconstructionModel) -> int:
+    """Predict the memory that 8 photos of 4:3 need together."""
+    from freegeo.adaptation.memory import plan_reconstruction
+    from freegeo.models.precision import Compute
+
+    # A budget that no result exceeds; the planner takes long for one that is far larger.
+    budget = 1000 * sum(parameter.numel() for parameter in model.parameters())
+    parts, _ = plan_reconstruction(model, VIEWS, image_hw(model), compute=Compute(), budget=budget)
+    return sum(size for _, size in parts)
+
+
+def adaptation_bytes(model: ReconstructionModel) -> tuple[int, int]:
+    """Predict the memory of adapting to 8 photos of 4:3 in bf16 on a GPU: as fast as possible, and as small."""
+    import torch
+
+    from freegeo.adaptation.memory import Footprint
+    from freegeo.adaptation.recipe import SEED, scene
+    from freegeo.adaptation.samples import SceneImages
+    from freegeo.adaptation.views import schedule
+    from freegeo.models.precision import Compute
+
+    recipe, (height, width) = scene(model.spec), image_hw(model)
+    photos = SceneImages(name="photos", count=VIEWS, load=lambda frames: torch.empty(len(frames), 3, height, width))
+    compute = Compute(device=torch.device("cuda"), precision="bf16")
+    job = Footprint(model, [photos], recipe, schedule([VIEWS], recipe, SEED), compute)
+    return job.plan("device", checkpointing=False).peak_bytes, job.plan("disk", checkpointing=True).peak_bytes
+
+
+def image_hw(model: ReconstructionModel) -> tuple[int, int]:
+    """Return the size of a 4:3 photo after preprocessing."""
+    side, patch = model.spec.default_side, model.spec.patch_size
+    return round(side * 3 / 4 / patch) * patch, side
 
 
 @app.command
 def describe(model: str) -> None:
-    """Say what a model is, where its weights come from, and what an adapter of it trains.
+    """Say what a model is, where its weights come from, how much memory it needs, and what an adapter of it trains.
 
     Parameters
     ----------
     model
-        Catalog name.
+        Name or hub id of a model.
     """
     from freegeo.adaptation.adapter import count_trainable
 
     item = catalog.entry(model)
+    built = catalog.build_empty(model)
+    spec, (height, width) = built.spec, image_hw(built)
+    fast, small = adaptation_bytes(built)
     console.say(f"{item.name}: {item.about}")
     console.say(f"licence of the weights: {item.licence}")
-    console.say(f"weights: {item.hub_id or item.packaged_weights or 'local file (--checkpoint)'}")
-    if item.build is None:
-        console.say("not implemented yet")
-        return
-    built = catalog.build_empty(model)
-    total = sum(parameter.numel() for parameter in built.parameters())
-    spec = built.spec
+    source = f"{item.hub_id}, {item.hub_file}" if item.hub_id else item.packaged_weights or "local file (--checkpoint)"
+    console.say(f"weights: {source}")
+    console.say(f"parameters: {sum(parameter.numel() for parameter in built.parameters()):,}")
+    if item.hub_id:
+        console.say(f"download: {_gigabytes(item.download_bytes)}")
     console.say(
-        f"parameters: {total:,} ({total * 4 / 1e9:.2f} GB in float32, {total * 2 / 1e9:.2f} GB in half precision)"
+        f"memory for {VIEWS} photos of 4:3 ({width} x {height}): {_gigabytes(reconstruction_bytes(built))} to "
+        f"reconstruct; to adapt on a GPU {_gigabytes(fast)}, or {_gigabytes(small)} where that does not fit"
     )
     console.say(f"images: longest side {spec.default_side}, patches of {spec.patch_size}")
     console.say(
@@ -73,16 +119,16 @@ def describe(model: str) -> None:
 
 @app.command
 def download(model: str) -> None:
-    """Download a model's weights from the hub; an interrupted download continues.
+    """Download a model's weights from the hub; an interrupted download continues, a damaged file is replaced.
 
     Parameters
     ----------
     model
-        Catalog name.
+        Name or hub id of a model.
     """
     item = catalog.entry(model)
     console.say(f"licence of the weights: {item.licence}")
-    console.say(str(catalog.download(model)))
+    console.say(str(catalog.download(model, check_hash=True)))
 
 
 @app.command
@@ -92,7 +138,7 @@ def check(model: str, checkpoint: Path) -> None:
     Parameters
     ----------
     model
-        Catalog name.
+        Name or hub id of a model.
     checkpoint
         File or folder.
     """
@@ -100,8 +146,8 @@ def check(model: str, checkpoint: Path) -> None:
 
     path = checkpoints.find_file(checkpoint)
     item = catalog.entry(model)
-    checkpoints.require_fit(catalog.build_empty(model), path, item.keys, model)
-    console.say(f"{path}: fits {model} (fingerprint {checkpoints.fingerprint(path)})")
+    checkpoints.require_fit(catalog.build_empty(model), path, item.keys, item.name)
+    console.say(f"{path}: fits {item.name} (fingerprint {checkpoints.fingerprint(path)})")
 
 
 @app.command
@@ -120,7 +166,7 @@ def score(
     Parameters
     ----------
     model
-        Catalog name.
+        Name or hub id of a model.
     checkpoint
         Local weight file or folder, such as the one that `freegeo train-tiny` writes.
     output

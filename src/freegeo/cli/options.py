@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from cyclopts import Parameter
 
 from freegeo.adaptation.recipe import PAPER, SEED, DatasetName, Recipe, RecipeName, named
+from freegeo.cli import console
+from freegeo.cli.sources import DEMO
 from freegeo.data.photos import MAX_VIEWS
 from freegeo.errors import UserError
-from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL
+from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL, entry, warn_of_embedded_model
 
 SMALL_MODEL = 20_000_000
 """Parameters below which a model runs on one CPU thread."""
@@ -29,24 +31,41 @@ if TYPE_CHECKING:
 class ModelOptions:
     """Which model runs, and where."""
 
-    model: str = DEFAULT_MODEL
-    """Catalog name (`freegeo models`) or a plug-in's."""
+    model: str | None = None
+    """Name (`freegeo models`) or hub id of a model, or a plug-in's name; default: da3-base."""
     checkpoint: Path | None = None
     """Local weight file or folder, instead of the download."""
     device: str | None = None
     """cpu, cuda, cuda:N or mps; default: the best at hand."""
     precision: Literal["fp32", "bf16", "fp16"] | None = None
-    """Arithmetic of the transformer; default: bf16 on CUDA, else fp32."""
+    """Arithmetic of the network: fp32 is exact, the others are faster; default: bf16 on CUDA, else fp32."""
     seed: int = SEED
-    """Seed of everything random."""
+    """Number that decides everything random."""
     reference: str | None = None
     """Reference view of predictions: first, middle, saddle_balanced, saddle_sim_range; default: the model's rule."""
+
+    @property
+    def name(self) -> str:
+        """The model's name in the catalog; UserError for an unknown one."""
+        return entry(self.model or DEFAULT_MODEL).name
+
+    def for_adapter(self, adapter: Path) -> Self:
+        """Return the options with the model that an adapter was made for; UserError when --model names another."""
+        made_for = model_of_adapter(adapter, self.model)
+        if self.model is None:
+            console.note(f"model: {made_for}, which the adapter was made for")
+        return replace(self, model=made_for)
+
+    def warn_of_embedded(self, sources: Sequence[str]) -> None:
+        """Say what the embedded model is not for, when it is used on photos other than the demo's."""
+        if self.name == EMBEDDED_MODEL and any(source != DEMO for source in sources):
+            warn_of_embedded_model()
 
     def load(self) -> ReconstructionModel:
         """Load the model."""
         from freegeo.models.catalog import load_model
 
-        model = load_model(self.model, checkpoint=self.checkpoint)
+        model = load_model(self.name, checkpoint=self.checkpoint)
         use_few_threads(model)
         return model
 
@@ -64,13 +83,13 @@ class ModelOptions:
         self.compute()
         if self.reference is not None:
             require_rule(self.reference)
-        return build_empty(self.model)
+        return build_empty(self.name)
 
     def weights(self) -> Path:
         """Return the weight file, which is downloaded where needed."""
         from freegeo.models.catalog import weights_file
 
-        return weights_file(self.model, self.checkpoint)
+        return weights_file(self.name, self.checkpoint)
 
     def checkpoint_identity(self) -> dict[str, str]:
         """Return the name of the weight file and a fingerprint of its content."""
@@ -82,7 +101,7 @@ class ModelOptions:
     def identity(self) -> dict[str, object]:
         """Return what an adapter depends on, for comparison with an existing folder."""
         return {
-            "model": self.model,
+            "model": self.name,
             "checkpoint": self.checkpoint_identity()["fingerprint"],
             "precision": self.compute().precision,
             "seed": self.seed,
@@ -95,7 +114,27 @@ class DemoModelOptions(ModelOptions):
     """A class of its own, since the parser takes the defaults of options that are left out from the class."""
 
     model: str = EMBEDDED_MODEL
-    """Catalog name (`freegeo models`) or a plug-in's."""
+    """Name (`freegeo models`) or hub id of a model, or a plug-in's name."""
+
+
+def model_of_adapter(adapter: Path, model: str | None) -> str:
+    """Return the catalog name of the model that an adapter was made for; `model` is what --model says.
+
+    UserError when the folder holds no adapter, when --model names another model, and when neither says which it is.
+    """
+    from freegeo.adaptation.adapter_files import adapter_metadata, read_peft
+
+    read_peft(adapter)
+    metadata = adapter_metadata(adapter)
+    stated = metadata["base"]["model"] if metadata else model
+    if stated is None:
+        raise UserError(f"{adapter}: does not say which model it was made for. Name that with --model.")
+    made_for = entry(stated).name
+    if model is not None and entry(model).name != made_for:
+        raise UserError(
+            f"{adapter}: the adapter was made for {made_for}, not for {entry(model).name}. Leave --model out."
+        )
+    return made_for
 
 
 def use_few_threads(model: ReconstructionModel) -> None:
@@ -112,25 +151,25 @@ class RecipeOptions:
     """How the model is adapted; options left out come from the recipe."""
 
     recipe: RecipeName = "scene"
-    """Named settings; the last three also need --dataset."""
+    """Named settings: scene for your own photos, the others as published, which also need --dataset."""
     dataset: DatasetName | None = None
-    """Whose published settings a dataset recipe takes."""
+    """Dataset whose published settings are used, with every recipe but scene."""
     views: int | None = None
-    """Views the teacher sees (8)."""
+    """Photos in one training example; the model learns to see from some of them what it sees from all. Default: 8."""
     keep: str | None = None
-    """Positions the student keeps, such as 0,2,4,6 (every second)."""
+    """Which of these photos it learns to see it from, counted from 0, such as 0,2,4,6. Default: every second one."""
     steps: int | None = None
-    """Optimiser steps."""
+    """Training steps. Default: 100 with recipe scene, else by --epochs."""
     epochs: int | None = None
-    """Passes over all view sets, instead of steps."""
+    """Passes over all training examples, instead of --steps. Default: 3 to 5, by dataset."""
     sets: int | None = None
-    """View sets per scene."""
+    """Training examples drawn from a scene. Default: 10 with recipe scene, else by dataset."""
     lr: float | None = None
-    """Peak learning rate."""
+    """Highest learning rate. Default: 3e-5 with recipe scene (freegeo-tiny: 1e-3), else by dataset."""
     rank: int | None = None
-    """Rank of the adapter."""
+    """Size of the adapter: rank of its matrices. Default: 32 (freegeo-tiny: 16)."""
     hold: float | None = None
-    """Weight of keeping what the model says with all views as it is (0: the paper; 1 where more views get worse)."""
+    """How strongly the answer from all photos is held where it was. Default: 0; try 1 where many photos get worse."""
     loss: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     """Settings of the loss, such as weight_kq=0 or selection=topk,angle_weights=2,2,2; may be given several times."""
 

@@ -27,7 +27,14 @@ def reconstruct(
     sources
         A folder of photos, a glob in quotes, photo files, a video, or `demo` (a generated room).
     adapter
-        Folder of a saved adapter; without it the frozen model is used.
+        Folder of a saved adapter, or the output folder of a run; it decides the model. Without it the frozen
+        model is used.
     """
+    from freegeo.adaptation.adapter_files import find_adapter
+
+    if adapter is not None:
+        adapter = find_adapter(adapter)
+        model = model.for_adapter(adapter)
     found = load_source(sources, photos)
+    model.warn_of_embedded(sources)
     run_job(found, model, output, command="reconstruct", recipe=None, adapter=adapter, files=files)

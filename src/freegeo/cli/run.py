@@ -31,4 +31,5 @@ def run(
         Adapt before reconstructing; --no-adapt uses the frozen model.
     """
     found = load_source(sources, photos)
+    model.warn_of_embedded(sources)
     run_job(found, model, output, command="run", recipe=recipe if adapt else None, files=files)

@@ -24,27 +24,40 @@ FAMILIES = (
 DEFAULT_MODEL = "da3-base"
 EMBEDDED_MODEL = "freegeo-tiny"
 PLUGIN_GROUP = "freegeo.models"
-REACHABLE_WITHIN_S = 5.0
 
 
 def names() -> list[str]:
-    """Return all model names: our own, then those of installed plug-ins."""
-    own = list(_own_entries())
-    return own + sorted(set(_plugin_points()) - set(own))
+    """Return the names of all models that can be used: our own, then those of installed plug-ins."""
+    own = [name for name, item in _own_entries().items() if item.build is not None]
+    return own + sorted(set(_plugin_points()) - set(_own_entries()))
 
 
 def entry(name: str) -> ModelEntry:
-    """Look a model up, ours before a plug-in's; UserError lists the names that exist."""
-    own = _own_entries()
-    if name in own:
-        return own[name]
-    points = _plugin_points()
-    if name in points:
-        item = points[name].load()
+    """Look a model up by its name or hub id, ours before a plug-in's; UserError lists the names that exist.
+
+    Capitals make no difference, and the address of a page on the hub stands for its id.
+    """
+    wanted = name.strip().removeprefix("https://huggingface.co/").strip("/").lower()
+    for item in _own_entries().values():
+        if wanted in (item.name.lower(), (item.hub_id or "").lower()):
+            return item
+    points = {known.lower(): point for known, point in _plugin_points().items()}
+    if wanted in points:
+        point = points[wanted]
+        item = point.load()
         if not isinstance(item, ModelEntry):
-            raise FreeGeoError(f"the plug-in '{name}' ({points[name].value}) is no ModelEntry. Tell its author.")
+            raise FreeGeoError(f"the plug-in '{point.name}' ({point.value}) is no ModelEntry. Tell its author.")
         return item
     raise UserError(f"unknown model '{name}'. Known are {', '.join(names())}.")
+
+
+def warn_of_embedded_model() -> None:
+    """Warn that the embedded model is not for real photos."""
+    logger.warning(
+        "%s was trained on generated rooms at 64 x 48 pixels, for demonstrations and tests: on real photos its cameras "
+        "are mostly wrong (AUC@30 of .03 to .12); use %s or another model of `freegeo models`.",
+        EMBEDDED_MODEL, DEFAULT_MODEL,
+    )  # fmt: skip
 
 
 def build_empty(name: str) -> ReconstructionModel:
@@ -66,12 +79,18 @@ def load_model(name: str = DEFAULT_MODEL, *, checkpoint: str | Path | None = Non
     build = _buildable(name)
     path = weights_file(name, checkpoint)
     model = checkpoints.build_on_meta(build)
-    checkpoints.load_weights(model, path, item.keys, name)
+    try:
+        checkpoints.load_weights(model, path, item.keys, item.name)
+    except UserError as error:
+        if checkpoint or item.packaged_weights:
+            raise
+        remedy = f"`freegeo models download {item.name}` checks that file and replaces it if it is damaged."
+        raise UserError(f"{error} {remedy}") from None
     model.eval()
     model.loaded_from = LoadedFrom(
-        model=name, file=path.name, fingerprint=checkpoints.fingerprint(path), licence=item.licence
+        model=item.name, file=path.name, fingerprint=checkpoints.fingerprint(path), licence=item.licence
     )
-    logger.info("%s loaded from %s; licence of the weights: %s", name, path, item.licence)
+    logger.info("%s loaded from %s; licence of the weights: %s", item.name, path, item.licence)
     return model
 
 
@@ -83,57 +102,20 @@ def weights_file(name: str, checkpoint: str | Path | None = None) -> Path:
     return checkpoints.find_file(Path(checkpoint)) if checkpoint else _packaged_or_downloaded(item)
 
 
-def download(name: str) -> Path:
-    """Fetch a model's checkpoint from the hub (resumable) and return its path."""
+def download(name: str, *, check_hash: bool = False) -> Path:
+    """Fetch a model's checkpoint from the hub (resumable) and return its path; a damaged one is fetched again.
+
+    `check_hash` reads the whole of a file that is there already; without it, its length is checked.
+    """
     item = entry(name)
+    _buildable(name)
     if item.packaged_weights is not None:
         return item.packaged_weights
     if item.hub_id is None:
-        raise UserError(f"{name} has no download; give its weights with --checkpoint.")
-    import huggingface_hub
-    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError
+        raise UserError(f"{item.name} has no download; give its weights with --checkpoint.")
+    from freegeo.models.hub import fetch
 
-    cached = huggingface_hub.try_to_load_from_cache(item.hub_id, item.hub_file)
-    if isinstance(cached, str):
-        return Path(cached)
-    try:
-        _require_reachable(huggingface_hub.hf_hub_url(item.hub_id, item.hub_file))
-        return Path(huggingface_hub.hf_hub_download(item.hub_id, item.hub_file))
-    except (LocalEntryNotFoundError, HfHubHTTPError, OSError, _http_error()) as error:
-        logger.debug("download of %s failed: %s", item.hub_id, error)
-        raise UserError(
-            f"the checkpoint of {name} ({item.hub_id}, {item.download_gb:.1f} GB) is not on this machine and could not "
-            f"be downloaded. {_how_to_download(item)}, pass --checkpoint FILE, or use the embedded model: "
-            f"--model {EMBEDDED_MODEL}."
-        ) from None
-
-
-def _require_reachable(url: str) -> None:
-    """Request a file's headers once, without the hub library's retries, which take half a minute when offline."""
-    import huggingface_hub
-
-    hub_logger = logging.getLogger("huggingface_hub")
-    level = hub_logger.level
-    hub_logger.setLevel(logging.CRITICAL)
-    try:
-        huggingface_hub.get_hf_file_metadata(url, timeout=REACHABLE_WITHIN_S)
-    finally:
-        hub_logger.setLevel(level)
-
-
-def _http_error() -> type[Exception]:
-    """Return the base of the network errors of the hub library's client: httpx or httpx2, by its version."""
-    import huggingface_hub
-
-    client = type(huggingface_hub.get_session()).__module__.partition(".")[0]
-    return importlib.import_module(client).HTTPError
-
-
-def _how_to_download(item: ModelEntry) -> str:
-    command = f"`freegeo models download {item.name}`"
-    if not item.gated:
-        return f"Go online and run {command}"
-    return f"Accept its licence at https://huggingface.co/{item.hub_id}, log in with `hf auth login` and run {command}"
+    return fetch(item, check_hash=check_hash)
 
 
 def _packaged_or_downloaded(item: ModelEntry) -> Path:
@@ -147,7 +129,7 @@ def _packaged_or_downloaded(item: ModelEntry) -> Path:
 def _buildable(name: str) -> Callable[[], ReconstructionModel]:
     item = entry(name)
     if item.build is None:
-        raise UserError(f"{name} is listed but not implemented yet: {item.about}")
+        raise UserError(f"{item.name} is not implemented: {item.about}")
     return item.build
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -49,20 +49,14 @@ class KeyRules:
     """How the names in a checkpoint file become the names of a model's state dict."""
 
     prefix: str = ""
-    """Removed from every name; a file without it is accepted too."""
+    """Written in front of every name; of a file that is read, whatever prefix its names share is taken off."""
     skipped: tuple[str, ...] = ()
-    """Prefixes (after removal) of parts that are not built."""
+    """Prefixes (after that) of parts that are not built."""
     aliases: Mapping[str, str] = field(default_factory=dict)
     """Names of a shared tensor that a file may leave out -> the name it is stored under."""
 
-    def translate(self, names: Sequence[str]) -> dict[str, str]:
-        """Return our name -> file name, for the names that are not skipped."""
-        has_prefix = bool(self.prefix) and any(name.startswith(self.prefix) for name in names)
-        ours = {(name.removeprefix(self.prefix) if has_prefix else name): name for name in names}
-        return {our: name for our, name in ours.items() if not our.startswith(self.skipped or ("\0",))}
-
     def file_names(self, names: Iterable[str]) -> dict[str, str]:
-        """Return our name -> file name for a file that leaves the aliases out, which `translate` reads back."""
+        """Return our name -> file name for a file that leaves the aliases out."""
         return {name: self.prefix + name for name in names if name not in self.aliases}
 
 
@@ -87,9 +81,9 @@ class ModelEntry:
     """Weights that come with an installed package."""
 
     @property
-    def download_gb(self) -> float:
+    def download_bytes(self) -> int:
         """Size of the float32 checkpoint."""
-        return self.parameters * 4 / 1e9
+        return self.parameters * 4
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,301 @@
+"""Downloads: what is in the cache is checked, a damaged file is fetched again, and a failure names its true reason."""
+
+import errno
+import hashlib
+import logging
+import os
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import huggingface_hub
+import pytest
+import torch
+from huggingface_hub import constants
+from safetensors.torch import save
+
+from freegeo.errors import UserError
+from freegeo.models import catalog, hub
+
+COMMIT = "0123456789" * 4
+CONTENT = save({"model.x": torch.arange(5000.0)})
+CLOSED = "http://127.0.0.1:9"
+ENVIRONMENT = (
+    *("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY", "HF_TOKEN", "SSL_CERT_FILE", "SSL_CERT_DIR"),
+    *("http_proxy", "https_proxy", "all_proxy", "no_proxy"),
+)
+
+
+class Hub:
+    """A model hub on this machine: what it sends, how it answers, and what it was asked for."""
+
+    def __init__(self):
+        self.content, self.status, self.tag, self.asked, self.is_hub = CONTENT, 200, None, [], True
+        ours = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def answer(self, *, with_content: bool) -> None:
+                ours.asked.append(f"{self.command} {self.path}")
+                self.send_response(ours.status)
+                if ours.is_hub:
+                    self.send_header("X-Repo-Commit", COMMIT)
+                    self.send_header("ETag", f'"{ours.tag or hashlib.sha256(ours.content).hexdigest()}"')
+                self.send_header("Content-Length", str(len(ours.content)))
+                self.end_headers()
+                if with_content:
+                    self.wfile.write(ours.content)
+
+            def do_HEAD(self):
+                self.answer(with_content=False)
+
+            def do_GET(self):
+                self.answer(with_content=True)
+
+            def log_message(self, *arguments):
+                pass
+
+        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self.server.server_port}"
+
+
+@pytest.fixture(scope="module")
+def running_hub():
+    hub = Hub()
+    thread = threading.Thread(target=hub.server.serve_forever, args=(0.01,))
+    thread.start()
+    yield hub
+    hub.server.shutdown()
+    thread.join()
+    hub.server.server_close()
+
+
+@pytest.fixture(autouse=True)
+def cache(monkeypatch, tmp_path) -> Path:
+    """An empty cache, an environment without proxies, and a client that is made anew in it."""
+    for name in ENVIRONMENT:
+        monkeypatch.delenv(name, raising=False)
+    folder = tmp_path / "cache"
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(folder))
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr(constants, "HF_TOKEN_PATH", str(tmp_path / "token"))
+    use_endpoint(monkeypatch, CLOSED)
+    huggingface_hub.close_session()
+    yield folder
+    huggingface_hub.close_session()
+
+
+def use_endpoint(monkeypatch, url: str) -> None:
+    monkeypatch.setattr(constants, "ENDPOINT", url)
+    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", url + "/{repo_id}/resolve/{revision}/{filename}")
+
+
+@pytest.fixture
+def online(monkeypatch, running_hub) -> Hub:
+    """The hub in its usual state."""
+    running_hub.content, running_hub.status, running_hub.tag, running_hub.is_hub = CONTENT, 200, None, True
+    running_hub.asked.clear()
+    use_endpoint(monkeypatch, running_hub.url)
+    return running_hub
+
+
+def reason(name: str = "da3-base") -> str:
+    """Fail to download a model and return why."""
+    with pytest.raises(UserError) as error:
+        catalog.download(name)
+    text = str(error.value)
+    assert "\n" not in text and len(text) < 700
+    assert "could not be downloaded: " in text
+    assert f"run `freegeo models download {name}`" in text
+    assert "pass --checkpoint FILE" in text
+    return text
+
+
+# -- the cache
+
+
+def test_a_file_is_downloaded_once_and_then_needs_no_network(online, caplog):
+    path = catalog.download("da3-base")
+    assert path.read_bytes() == CONTENT
+    asked = len(online.asked)
+    assert "GET /depth-anything/DA3-BASE/resolve/main/model.safetensors" in online.asked
+    assert catalog.download("da3-base") == catalog.download("da3-base", check_hash=True) == path
+    assert len(online.asked) == asked
+    assert caplog.text == ""
+
+
+def damaged(path: Path, kind: str) -> None:
+    """Damage a file of the cache where it is, also where it is a link."""
+    content = {
+        "truncated": CONTENT[:9000],
+        "without its last byte": CONTENT[:-1],
+        "empty": b"",
+        "longer": CONTENT + b"x",
+        "another content": CONTENT[:-4] + b"\0\0\0\0",
+    }[kind]
+    path.resolve().write_bytes(content)
+
+
+@pytest.mark.parametrize("kind", ["truncated", "without its last byte", "empty", "longer"])
+def test_a_damaged_file_is_downloaded_again(online, caplog, kind):
+    path = catalog.download("da3-base")
+    damaged(path, kind)
+    caplog.set_level(logging.INFO, "freegeo")
+    assert catalog.download("da3-base") == path
+    assert path.read_bytes() == CONTENT
+    assert f"{path}: truncated or damaged; it is downloaded again." in caplog.text
+
+
+def test_a_file_of_the_right_length_with_another_content_is_found_by_its_hash(online):
+    path = catalog.download("da3-base")
+    damaged(path, "another content")
+    assert catalog.download("da3-base", check_hash=True) == path
+    assert path.read_bytes() == CONTENT
+
+
+def test_a_cache_without_links_is_checked_too(online, cache):
+    place = cache / "models--depth-anything--DA3-BASE"
+    (place / "snapshots" / COMMIT).mkdir(parents=True)
+    (place / "refs").mkdir()
+    (place / "refs" / "main").write_text(COMMIT)
+    path = place / "snapshots" / COMMIT / "model.safetensors"
+    path.write_bytes(CONTENT[:9000])
+    assert catalog.download("da3-base") == path
+    assert path.read_bytes() == CONTENT
+
+
+def test_a_damaged_file_without_a_network_is_named(online, monkeypatch):
+    path = catalog.download("da3-base")
+    damaged(path, "truncated")
+    use_endpoint(monkeypatch, CLOSED)
+    text = reason()
+    assert f"is damaged ({path})" in text
+    assert "Connection refused" in text
+    assert path.exists()
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_zip_of_weights_is_checked_by_its_end(online, monkeypatch, tmp_path, whole):
+    torch.save({"x": torch.zeros(9000)}, tmp_path / "m.pt")
+    online.content = (tmp_path / "m.pt").read_bytes()
+    path = catalog.download("vggt-1b-commercial")
+    asked = len(online.asked)
+    if not whole:
+        path.resolve().write_bytes(online.content[:-100])
+    assert catalog.download("vggt-1b-commercial").read_bytes() == online.content
+    assert (len(online.asked) == asked) == whole
+
+
+def test_a_download_that_is_damaged_on_the_way_is_refused(online):
+    online.tag = "0" * 64
+    with pytest.raises(UserError, match=r"the download differs from what http://127.*announced"):
+        catalog.download("da3-base")
+
+
+def test_weights_that_do_not_load_name_the_repair(online):
+    with pytest.raises(UserError, match=r"does not fit da3-base.*`freegeo models download da3-base` checks that file"):
+        catalog.load_model("da3-base")
+
+
+# -- reasons
+
+
+@pytest.mark.parametrize(
+    ("variables", "words"),
+    [
+        ({"ALL_PROXY": "socks5://127.0.0.1:1080"}, ("ALL_PROXY=socks5://127.0.0.1:1080", "pip install socksio")),
+        ({"ALL_PROXY": "socks://127.0.0.1:7890/"}, ("ALL_PROXY=socks://127.0.0.1:7890/", "http://HOST:PORT")),
+        ({"https_proxy": "http://proxy:port"}, ("https_proxy=http://proxy:port", "http://HOST:PORT")),
+        ({"HTTP_PROXY": "ftp://127.0.0.1"}, ("HTTP_PROXY=ftp://127.0.0.1", "http://HOST:PORT")),
+        ({"HTTP_PROXY": "http://127.0.0.1:9"}, ("through HTTP_PROXY=http://127.0.0.1:9", "Connection refused")),
+        ({"SSL_CERT_FILE": "/nonexistent/ca.pem"}, ("certificates", "SSL_CERT_FILE=/nonexistent/ca.pem")),
+        ({"SSL_CERT_FILE": __file__}, ("certificates", f"SSL_CERT_FILE={__file__}")),
+        ({"HF_TOKEN": "hf_é"}, ("access token", "HF_TOKEN")),
+    ],
+)
+def test_settings_that_are_wrong_are_named(monkeypatch, variables, words):
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    text = reason()
+    for part in words:
+        assert part in text
+
+
+def test_passwords_of_proxies_are_not_shown(monkeypatch):
+    monkeypatch.setenv("HTTP_PROXY", "http://me:secret@127.0.0.1:9")
+    text = reason()
+    assert "HTTP_PROXY=http://127.0.0.1:9" in text
+    assert "secret" not in text
+
+
+def test_a_hub_that_is_not_there():
+    assert f"{CLOSED} cannot be reached ([Errno {errno.ECONNREFUSED}] Connection refused). Go online" in reason()
+
+
+def test_an_endpoint_without_its_protocol(monkeypatch):
+    use_endpoint(monkeypatch, "127.0.0.1:9")
+    assert "127.0.0.1:9 cannot be reached (Request URL is missing an 'http://'" in reason()
+
+
+def test_offline_mode_is_named(monkeypatch):
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    assert "HF_HUB_OFFLINE is set, which forbids downloads. Unset it" in reason()
+
+
+@pytest.mark.parametrize(
+    ("status", "words"),
+    [(404, "answered 404 for depth-anything/DA3-BASE/model.safetensors. Check HF_ENDPOINT"), (401, "answered 401"),
+     (403, "answered 403 for"), (503, "answered 503 for")],
+)  # fmt: skip
+def test_answers_that_are_errors_are_given_by_number(online, status, words):
+    online.status = status
+    assert words in reason()
+
+
+@pytest.mark.parametrize("status", [401, 403])
+def test_a_licence_to_be_accepted_is_named(online, status):
+    online.status = status
+    text = reason("vggt-1b-commercial")
+    assert "Accept it at https://huggingface.co/facebook/VGGT-1B-Commercial, log in with `hf auth login`" in text
+
+
+def test_a_page_that_is_no_hub(online):
+    online.is_hub = False
+    assert "does not answer as a model hub does. Check HF_ENDPOINT and the proxy" in reason()
+
+
+def test_a_full_disk_is_named(online, monkeypatch, cache):
+    def full(*arguments, **options):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", full)
+    assert f"the disk of {cache} is full. Make room, or set HF_HOME to another disk" in reason()
+
+
+def test_a_cache_that_cannot_be_written_to(online, monkeypatch):
+    def denied(*arguments, **options):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "/cache/blobs")
+
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", denied)
+    assert "/cache/blobs cannot be written to. Set HF_HOME" in reason()
+
+
+def test_a_cache_in_the_place_of_a_file(online, cache):
+    cache.parent.mkdir(exist_ok=True)
+    cache.write_text("a file")
+    assert "could not be downloaded: " in reason()
+
+
+def test_any_other_reason_is_given_as_it_is(online, monkeypatch):
+    def broken(*arguments, **options):
+        raise RuntimeError("Data processing error: chunk 3\nmore")
+
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", broken)
+    assert "could not be downloaded: Data processing error: chunk 3. " in reason()
+
+
+def test_an_unreachable_hub_is_noticed_before_the_download_and_without_noise(monkeypatch, caplog):
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", lambda *arguments, **options: pytest.fail("asked"))
+    reason("da3-small")
+    assert caplog.text == ""
+    assert logging.getLogger("huggingface_hub").level != logging.CRITICAL
+    assert hub.REACHABLE_WITHIN_S <= 10
