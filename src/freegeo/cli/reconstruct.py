@@ -30,4 +30,6 @@ def reconstruct(
         Folder of a saved adapter; without it the frozen model is used.
     """
     found = load_source(sources, photos)
-    run_job(found, model, output, command="reconstruct", recipe=None, adapter=adapter, files=files)
+    run_job(
+        found, model, output, command="reconstruct", recipe=None, adapter=adapter, mixed=photos.mixed, files=files
+    )  # fmt: skip

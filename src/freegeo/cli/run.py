@@ -31,4 +31,5 @@ def run(
         Adapt before reconstructing; --no-adapt uses the frozen model.
     """
     found = load_source(sources, photos)
-    run_job(found, model, output, command="run", recipe=recipe if adapt else None, files=files)
+    plan = recipe if adapt else None
+    run_job(found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files)
