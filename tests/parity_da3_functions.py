@@ -155,7 +155,7 @@ def check_size_row(row: dict) -> bool:
 
 def check_batch_row(row: dict) -> bool:
     photos = [MemoryPhoto(np.zeros((h, w, 3), np.uint8)) for w, h in row["inputs_wh"]]
-    batch = preprocess(photos, side=row["process_res"], patch=14)
+    batch = preprocess(photos, side=row["process_res"], patch=14, mixed="upstream")
     K = batch.model_K(torch.tensor([[[k[0], 0, k[2]], [0, k[1], k[3]], [0, 0, 1]] for k in row["K_in"]]))
     ours = torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]], dim=-1)
     return list(batch.images.shape) == row["batch_shape"] and np.allclose(ours, row["K_out"], rtol=1e-5)

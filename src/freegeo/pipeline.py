@@ -40,8 +40,9 @@ from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import EMBEDDED_MODEL, warn_of_embedded_model
+from freegeo.models.images import read_photos
 from freegeo.models.precision import Compute
-from freegeo.models.spec import ModelSpec
+from freegeo.models.spec import MIXED, Mixed, ModelSpec
 from freegeo.progress import step_bar
 from freegeo.report.page import write_report
 from freegeo.run_folder import Part, RunFolder
@@ -113,6 +114,7 @@ def reconstruct(
     device: str | None = None,
     precision: str | None = None,
     max_views: int = MAX_VIEWS,
+    mixed: Mixed = MIXED,
 ) -> Reconstruction:
     """Reconstruct photos: depth, confidence and cameras of every view.
 
@@ -125,6 +127,9 @@ def reconstruct(
         device: cpu, cuda, cuda:N or mps; None: the best available.
         precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
         max_views: most photos that are used; a list that `freegeo.load_photos` returned is used whole.
+        mixed: how photos of different shapes become images of one size: `crop` fits the odd ones to the others, `pad`
+            puts white around all, `upstream` is the rule of the model's authors. Cutting more than 10 % of a photo
+            gives a warning.
 
     Raises:
         UserError: an argument that cannot be used, or views that do not fit into memory together.
@@ -132,7 +137,7 @@ def reconstruct(
     _require_model(model)
     _warn_of_embedded_model(model)
     compute = Compute.choose(device, precision)
-    batch = model.preprocess(load_photos(photos, max_views))
+    batch = read_photos(model, load_photos(photos, max_views), mixed=mixed)
     with _applied(model, adapter):
         return predict(model, batch, reference=reference, compute=compute)
 
@@ -191,6 +196,7 @@ def adapt(
     device: str | None = None,
     precision: str | None = None,
     max_views: int = MAX_VIEWS,
+    mixed: Mixed = MIXED,
     resume_in: str | Path | None = None,
     progress: bool = False,
     on_step: Callable[[Progress], None] = lambda progress: None,
@@ -217,6 +223,7 @@ def adapt(
         device: cpu, cuda, cuda:N or mps; None: the best available.
         precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
         max_views: most photos that are used; a list that `freegeo.load_photos` returned is used whole.
+        mixed: how photos of different shapes become images of one size, as for `reconstruct`.
         resume_in: folder for the state of an unfinished run: the same call continues it. `result.save` to that folder
             removes the state.
         progress: show a bar in a terminal or notebook, lines in a log file; without it nothing is printed.
@@ -235,7 +242,7 @@ def adapt(
     )  # fmt: skip
     found = load_photos(photos, max_views)
     require_enough_photos(found)
-    scene = scene_images("photos", found, model, plan, model.preprocess(found))
+    scene = scene_images("photos", found, model, plan, read_photos(model, found, mixed=mixed))
     folder = None if resume_in is None else Path(resume_in).expanduser()
     with step_bar(on_step) if progress else nullcontext(on_step) as follow:
         return train_adapter(model, [scene], plan, seed=seed, compute=compute, resume_in=folder, on_step=follow)

@@ -62,6 +62,17 @@ class ImageBatch:
         """Height and width of the images."""
         return self.images.shape[-2], self.images.shape[-1]
 
+    def inside(self) -> Tensor:
+        """Mask (S, H, W) bool of the pixels that show the photo; the others are padding."""
+        return inside_photo(self.photo_hw, self.scale_xy, self.offset_xy, self.image_hw)
+
+    def seen_share(self) -> Tensor:
+        """Share (S,) float64 of each photo's area that its image shows; below 1 where the photo is cropped."""
+        photo_xy, image_xy = self.photo_hw.flip(-1), self.photo_hw.new_tensor(self.image_hw[::-1])
+        first = (-self.offset_xy / self.scale_xy).clamp(min=0)
+        end = torch.minimum((image_xy - self.offset_xy) / self.scale_xy, photo_xy.double())
+        return ((end - first).clamp(min=0) / photo_xy).prod(-1)
+
     def select(self, views: Sequence[int]) -> Self:
         """Return the chosen views, in the order given."""
         index = torch.as_tensor(list(views), dtype=torch.long)
@@ -80,6 +91,15 @@ class ImageBatch:
         rows = K[:, :2] * self.scale_xy.to(K)[:, :, None]
         rows[:, :, 2] += self.offset_xy.to(K)
         return torch.cat([rows, K[:, 2:]], dim=1)
+
+
+def inside_photo(photo_hw: Tensor, scale_xy: Tensor, offset_xy: Tensor, image_hw: tuple[int, int]) -> Tensor:
+    """Mask (S, H, W) bool of the pixels of model images whose centre lies in the photo; arguments as `ImageBatch`."""
+    within = []
+    for axis, side in enumerate((image_hw[1], image_hw[0])):
+        place = (torch.arange(side) + 0.5 - offset_xy[:, axis, None]) / scale_xy[:, axis, None]
+        within.append((place >= 0) & (place < photo_hw[:, 1 - axis, None]))
+    return within[1][:, :, None] & within[0][:, None, :]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -103,8 +103,8 @@ def test_a_config_whose_last_layer_is_not_read_is_refused(model):
         VGGTConfig(**values)
 
 
-def test_mixed_sizes_are_padded_white_around_the_centre(model, photos):
-    batch = model.preprocess(photos((64, 48), (48, 64)))
+def test_upstream_pads_mixed_sizes_white_around_the_centre(model, photos):
+    batch = model.preprocess(photos((64, 48), (48, 64)), mixed="upstream")
     assert batch.images.shape == (2, 3, 504, 504)
     assert torch.equal(batch.scale_xy, torch.full((2, 2), 7.875, dtype=torch.float64))
     assert batch.offset_xy.tolist() == [[0.0, 63.0], [63.0, 0.0]]
@@ -113,7 +113,7 @@ def test_mixed_sizes_are_padded_white_around_the_centre(model, photos):
 
 
 def test_the_odd_pixel_of_a_border_is_at_the_end(photos):
-    batch = preprocess(photos((70, 21), (70, 28)), side=70, patch=7)
+    batch = preprocess(photos((70, 21), (70, 28)), side=70, patch=7, mixed="upstream")
     assert batch.images.shape == (2, 3, 28, 70)
     assert batch.offset_xy.tolist() == [[0.0, 3.0], [0.0, 0.0]]
     assert (batch.images[0, :, [0, 2, 24, 27]] == 1).all()

@@ -220,14 +220,20 @@ def _learn(
     tokens, teacher = sample.student()
     with run.compute.autocast():
         student = loss_features(adapter.model, tokens)
-    loss, terms = adaptation_loss(student.levels, teacher, sample.held_out, draws, recipe.loss, form=sample.form)
+    loss, terms = adaptation_loss(
+        student.levels, teacher, sample.held_out, draws, recipe.loss, form=sample.form,
+        patches=sample.student_patches(),
+    )  # fmt: skip
     scaler.scale(loss * share).backward()
     if recipe.hold:
         # Not in the paper: penalises the distance of the adapted features from the frozen ones, over all views.
         del tokens, teacher, student, loss
         with run.compute.autocast():
             adapted = loss_features(adapter.model, sample.tokens)
-        held = recipe.hold * feature_distance(adapted.levels, sample.teacher.levels, recipe.loss)[0]
+        held = (
+            recipe.hold
+            * feature_distance(adapted.levels, sample.teacher.levels, recipe.loss, patches=sample.patches)[0]
+        )
         scaler.scale(held * share).backward()
         terms = {**terms, "hold": held.detach(), "total": terms["total"] + held.detach()}
     return {name: term * share for name, term in terms.items()}

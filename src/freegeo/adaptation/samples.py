@@ -45,6 +45,10 @@ STEP_SEED_STRIDE = 1_000_003
 """Distance of the seeds of two runs; between them lie the seeds of a run's steps."""
 SPREAD_HEADROOM = 2.0
 """Factor by which the student's spread of softmax inputs may exceed the teacher's, measured once per view set."""
+SEEN_SHARE = 0.5
+"""Share of a patch that must lie in the photo for its token to take part in the losses; the rest is padding."""
+MIRRORED = 0.5
+"""Probability that the released augmentation mirrors a view set: the first draw of its seed."""
 AHEAD = 2
 """View sets whose images are decoded in the background before they are needed."""
 
@@ -59,17 +63,25 @@ class SceneImages:
     name: str
     count: int
     load: Callable[[Sequence[int]], Tensor]
+    inside: Tensor | None = None
+    """(count, H, W) bool: false where an image is padding; None: no image has any."""
 
     @classmethod
     def from_batch(cls, name: str, batch: ImageBatch) -> SceneImages:
         """Use images that are already at the model's size."""
-        return cls(name=name, count=len(batch), load=lambda frames: batch.images[list(frames)])
+        inside = batch.inside()
+        return cls(
+            name=name, count=len(batch), load=lambda frames: batch.images[list(frames)],
+            inside=None if inside.all() else inside,
+        )  # fmt: skip
 
     @classmethod
     def from_photos(
         cls, name: str, photos: Sequence[PhotoLike], model: ReconstructionModel, recipe: Recipe
     ) -> SceneImages:
-        """Decode photos on demand, preprocessed for the model or squashed as the recipe says.
+        """Decode photos on demand, preprocessed by upstream's rule or squashed as the recipe says.
+
+        As upstream, the losses compare the padding that the preprocessing may add.
 
         UserError when the recipe's square is no whole number of the model's patches.
         """
@@ -82,7 +94,7 @@ class SceneImages:
         def load(frames: Sequence[int]) -> Tensor:
             chosen = [photos[frame] for frame in frames]
             if recipe.squash is None:
-                return model.preprocess(chosen).images
+                return model.preprocess(chosen, mixed="upstream").images
             return torch.cat([squashed(torch.from_numpy(photo.read()), recipe.squash) for photo in chosen])
 
         return cls(name=name, count=len(photos), load=load)
@@ -101,10 +113,21 @@ def released_augmentation(images: Tensor, seed: int) -> Tensor:
     [.8, 1.2]; results are clipped to [0, 1] (docs/method.md, "Augmentation and view draws").
     """
     generator = random.Random(seed)
-    if generator.random() < 0.5:
+    if generator.random() < MIRRORED:
         images = images.flip(-1)
     factors = [generator.uniform(0.8, 1.2) if generator.random() < 0.5 else 1.0 for _ in images]
     return (images * images.new_tensor(factors)[:, None, None, None]).clamp(0, 1)
+
+
+def seen_patches(scene: SceneImages, view_set: ViewSet, grid_hw: tuple[int, int], recipe: Recipe) -> Tensor | None:
+    """Mask (N, P) bool of the patches of a view set of which at least half shows a photo; None: there is no padding."""
+    inside = None if scene.inside is None else scene.inside[list(view_set.frames)]
+    if inside is None or inside.all():
+        return None
+    if recipe.augmentation == "released" and random.Random(view_set.seed).random() < MIRRORED:
+        inside = inside.flip(-1)
+    patch = (inside.shape[1] // grid_hw[0], inside.shape[2] // grid_hw[1])
+    return (F.avg_pool2d(inside[:, None].float(), patch) >= SEEN_SHARE).flatten(1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,12 +144,18 @@ class Sample:
     """Positions of the student's views among `tokens`."""
     form: KLForm | None = None
     """How the all-pairs KL is computed; None: the loss measures it, which makes an accelerator wait."""
+    patches: Tensor | None = None
+    """(views of `tokens`, P) bool, on the CPU: patches that take part in the losses; None: all."""
 
     def student(self) -> tuple[ViewTokens, Mapping[int, Level]]:
         """Return tokens and teacher features of the student's views."""
         if len(self.kept) == self.tokens.tokens.shape[1]:
             return self.tokens, self.teacher.levels
         return self.tokens.select(self.kept), self.teacher.select(self.kept).levels
+
+    def student_patches(self) -> Tensor | None:
+        """Return the patches (M, P) of the student's views that take part in the losses; None: all."""
+        return None if self.patches is None else self.patches[list(self.kept)]
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors by name."""
@@ -171,6 +200,7 @@ class Samples:
     ):
         """`steps` are those still to come. `folder` (None: the system's temporary one) holds the files of `disk`."""
         self._adapter, self._recipe, self._compute, self._seed = adapter, recipe, compute, seed
+        self._scenes = scenes
         view_sets = [visit.view_set for visits in steps for visit in visits]
         self._left = Counter(sample_key(view_set, recipe) for view_set in view_sets)
         self._kept: dict[SampleKey, Sample] = {}
@@ -206,11 +236,13 @@ class Samples:
         with self._adapter.off(), self._compute.autocast():
             features = loss_features(model, tokens)
         read = view_set.positions if self._recipe.hold else view_set.kept
+        patches = seen_patches(self._scenes[view_set.scene], view_set, tokens.grid_hw, self._recipe)
         sample = Sample(
             tokens=tokens.select(read),
             teacher=features.select(read),
-            held_out=held_out_tokens(features.levels[max(features.levels)], view_set.kept, config),
+            held_out=held_out_tokens(features.levels[max(features.levels)], view_set.kept, config, patches=patches),
             kept=tuple(read.index(position) for position in view_set.kept),
+            patches=None if patches is None else patches[list(read)],
         )
         if self._compute.device.type == "cpu" or not config.uses_distances or config.pairing != "all":
             return sample
@@ -296,6 +328,8 @@ def step_draws(sample: Sample, visit: Visit, config: LossConfig, *, seed: int) -
         student_views=len(visit.view_set.kept),
         held_out_views=len(visit.view_set.frames) - len(visit.view_set.kept),
         generator=torch.Generator().manual_seed(seed * STEP_SEED_STRIDE + visit.step),
+        patches=sample.student_patches(),
+        held_out_count=sample.held_out.shape[1],
     ).to(patch.device)
 
 

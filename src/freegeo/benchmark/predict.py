@@ -203,7 +203,7 @@ class Predictor:
     def _read(self, scene: Scene, frames: Sequence[int]) -> tuple[ViewTokens, Cameras | None]:
         """The embedded frames and, where the run gives the model the true cameras, these in the model's convention."""
         chosen = scene.select(frames)
-        batch = self.model.preprocess(list(chosen.photos))
+        batch = self.model.preprocess(list(chosen.photos), mixed="upstream")
         tokens = self._embedded(batch.images)
         if not self.setup.given_cameras:
             return tokens, None

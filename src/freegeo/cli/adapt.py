@@ -45,6 +45,7 @@ def adapt(
     published
         Also write the adapter in the layout of the authors' release, below `published`.
     """
+    from freegeo.models.images import read_photos
     from freegeo.pipeline import require_enough_photos, scene_images
     from freegeo.run_folder import run_folder
 
@@ -55,7 +56,7 @@ def adapt(
     model.warn_of_embedded(sources)
     for found in scenes.values():
         require_enough_photos(found)
-    batches = {name: empty.preprocess(found) for name, found in scenes.items()}
+    batches = {name: read_photos(empty, found, mixed=photos.mixed) for name, found in scenes.items()}
     about = {name: {"photos": list(batch.names), "contents": batch.digest()} for name, batch in batches.items()}
     settings = {
         "command": "adapt", "scenes": about, "published": published, **model.identity(), "recipe": asdict(plan),

@@ -17,6 +17,7 @@ from freegeo.export.formats import FORMATS
 from freegeo.export.photos import FOLDER as COPIES_FOLDER
 from freegeo.export.photos import write_copies
 from freegeo.files import read_json
+from freegeo.models.spec import MIXED, Mixed
 from freegeo.progress import step_bar
 from freegeo.run_folder import check_folder, run_folder, stored_state
 
@@ -69,6 +70,7 @@ def run_job(
     command: str,
     recipe: RecipeOptions | None,
     adapter: Path | None = None,
+    mixed: Mixed = MIXED,
     files: FileOptions = DEFAULT_FILES,
     extra_settings: dict[str, Any] | None = None,
     after: Callable[[Job], None] = lambda job: None,
@@ -80,6 +82,7 @@ def run_job(
     counts as finished.
     """
     from freegeo.data.video import VideoFrame
+    from freegeo.models.images import read_photos
     from freegeo.pipeline import PARTS, SUMMARY_NAME, Job, require_enough_photos, scene_images
 
     check_place(output)
@@ -89,7 +92,7 @@ def run_job(
     if plan is not None:
         require_enough_photos(photos)
     masks = files.checked_masks(photos)
-    batch = empty.preprocess(photos)
+    batch = read_photos(empty, photos, mixed=mixed)
     adaptation = {
         "photos": list(batch.names), "photo_contents": batch.digest(), **model_options.identity(),
         "recipe": None if plan is None else asdict(plan),

@@ -16,6 +16,7 @@ from freegeo.cli.sources import DEMO
 from freegeo.data.photos import MAX_VIEWS
 from freegeo.errors import UserError
 from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL, entry, warn_of_embedded_model
+from freegeo.models.spec import MIXED, Mixed
 
 SMALL_MODEL = 20_000_000
 """Parameters below which a model runs on one CPU thread."""
@@ -225,7 +226,7 @@ def _read_like(example: object, text: str) -> object:
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class PhotoOptions:
-    """Which photos are used."""
+    """Which photos are used, and how."""
 
     max_views: int = MAX_VIEWS
     """Most photos that are used; of more, as many are chosen evenly."""
@@ -233,6 +234,8 @@ class PhotoOptions:
     """Videos: take a frame this often per second; default: by sharpness and parallax."""
     skip_bad: bool = False
     """Leave out photos that cannot be read, with a warning, instead of stopping."""
+    mixed: Mixed = MIXED
+    """Photos of different shapes: cut the odd ones, pad all with white (nothing is lost), or do as upstream does."""
 
 
 @Parameter(name="*")

@@ -37,4 +37,6 @@ def reconstruct(
         model = model.for_adapter(adapter)
     found = load_source(sources, photos)
     model.warn_of_embedded(sources)
-    run_job(found, model, output, command="reconstruct", recipe=None, adapter=adapter, files=files)
+    run_job(
+        found, model, output, command="reconstruct", recipe=None, adapter=adapter, mixed=photos.mixed, files=files
+    )  # fmt: skip

@@ -32,4 +32,5 @@ def run(
     """
     found = load_source(sources, photos)
     model.warn_of_embedded(sources)
-    run_job(found, model, output, command="run", recipe=recipe if adapt else None, files=files)
+    plan = recipe if adapt else None
+    run_job(found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files)

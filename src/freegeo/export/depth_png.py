@@ -1,7 +1,8 @@
 """``depth/``: one 16-bit PNG per photo at the model's resolution, and ``depth.json`` with the scale.
 
-`depth_z = value * scale`; 0 means no depth. One scale serves all views: the largest depth has the value 65535. The maps
-follow the user's masks, but none of the filters that thin point clouds: low confidence, flying pixels, other views.
+`depth_z = value * scale`; 0 means no depth, as in the padding around a photo. One scale serves all views: the largest
+depth has the value 65535. The maps follow the user's masks, but none of the filters that thin point clouds: low
+confidence, flying pixels, other views.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ MEANING = (
 
 
 def write_depth(reconstruction: Reconstruction, folder: Path, *, keep: np.ndarray | None = None) -> list[Path]:
-    """Write the maps and the JSON file, and return their paths; pixels outside `keep` (S, H, W) get 0."""
+    """Write the maps and the JSON file, and return their paths; pixels outside `keep` (S, H, W) or a photo get 0."""
     from PIL import Image, PngImagePlugin
 
     depth = reconstruction.depth_z

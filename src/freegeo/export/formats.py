@@ -82,7 +82,7 @@ def filter_reconstruction(
     T_cam_world, K = reconstruction.cameras()
     return filter_pixels(
         reconstruction.depth_z, reconstruction.conf, T_cam_world, K, sky=reconstruction.sky, masks=masks,
-        settings=settings,
+        inside=reconstruction.inside(), settings=settings,
     )  # fmt: skip
 
 

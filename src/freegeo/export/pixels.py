@@ -34,6 +34,8 @@ def corner_K(reconstruction: Reconstruction) -> np.ndarray:
 def masks_for_model(reconstruction: Reconstruction, masks: list[np.ndarray]) -> np.ndarray:
     """Turn a user's masks into one (S, H, W) bool for the model's maps, true where points are wanted.
 
+    It is false in the padding around a photo.
+
     Args:
         reconstruction: what the masks belong to.
         masks: one array per view, of the photo's or of the model's height and width; anything but 0 is wanted.
@@ -43,7 +45,8 @@ def masks_for_model(reconstruction: Reconstruction, masks: list[np.ndarray]) -> 
     """
     if len(masks) != len(reconstruction):
         raise UserError(f"{len(masks)} masks for {len(reconstruction)} views. Give one mask per photo, in their order.")
-    return np.stack([_model_mask(reconstruction, view, np.asarray(mask)) for view, mask in enumerate(masks)])
+    found = np.stack([_model_mask(reconstruction, view, np.asarray(mask)) for view, mask in enumerate(masks)])
+    return found & reconstruction.inside()
 
 
 def _model_mask(reconstruction: Reconstruction, view: int, mask: np.ndarray) -> np.ndarray:

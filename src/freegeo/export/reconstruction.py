@@ -115,8 +115,8 @@ class Reconstruction:
         return self.T_cam_world, self.K
 
     def valid_pixels(self) -> np.ndarray:
-        """Mask (S, H, W) bool of usable depth: finite and positive."""
-        return np.isfinite(self.depth_z) & (self.depth_z > 0)
+        """Mask (S, H, W) bool of usable depth: finite, positive, and not in padding."""
+        return np.isfinite(self.depth_z) & (self.depth_z > 0) & self.inside()
 
     def photo_K(self) -> np.ndarray:
         """Intrinsics (S, 3, 3) float64 of the original photos, pixel centres at whole numbers.
@@ -129,6 +129,15 @@ class Reconstruction:
 
         values = (self.cameras()[1].astype(np.float64), self.scale_xy, self.offset_xy)
         return photo_K(*map(torch.from_numpy, values)).numpy()
+
+    def inside(self) -> np.ndarray:
+        """Mask (S, H, W) bool of the pixels that show the photo; the others are padding."""
+        import torch
+
+        from freegeo.types import inside_photo
+
+        mapping = (self.photo_hw, self.scale_xy, self.offset_xy)
+        return inside_photo(*map(torch.from_numpy, mapping), self.image_hw).numpy()
 
     @classmethod
     def from_prediction(cls, prediction: Prediction, batch: ImageBatch) -> Reconstruction:

@@ -58,6 +58,8 @@ class Surfaces:
     """(S, H, W) relative depth difference that counts as the same surface: the tolerance and the slope."""
     barrier: Tensor
     """(S, H + 1, W + 1) depth before which a point between four pixels floats in front of all of their surfaces."""
+    inside: Tensor | None
+    """(S, H, W) bool: false where the image is padding; None: no padding."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +67,7 @@ class Lookup:
     """One view's pixels compared with the depth map of another."""
 
     asked: Tensor
-    """(H, W) bool: usable, and inside the target's image."""
+    """(H, W) bool: usable, and inside what the target's image shows."""
     agrees: Tensor
     """(H, W) bool: the nearest target pixel has the expected depth."""
     sees_through: Tensor
@@ -78,8 +80,19 @@ class Lookup:
     """(H, W) measured / expected - 1 at the nearest target pixel; NaN where not asked or not usable there."""
 
 
-def prepare(depth_z: Tensor, T_cam_world: Tensor, K: Tensor, usable: Tensor, *, tolerance: float) -> Surfaces:
-    """Prepare depth maps (S, H, W) for comparisons with a relative `tolerance`; only `usable` pixels take part."""
+def prepare(
+    depth_z: Tensor,
+    T_cam_world: Tensor,
+    K: Tensor,
+    usable: Tensor,
+    *,
+    tolerance: float,
+    inside: Tensor | None = None,
+) -> Surfaces:
+    """Prepare depth maps (S, H, W) for comparisons with a relative `tolerance`; only `usable` pixels take part.
+
+    `inside` (S, H, W) is false where an image is padding, which does not count as a place that its view looks at.
+    """
     known = torch.where(usable, depth_z, torch.nan)
     allowed = tolerance + relative_slope(known)
     front = torch.nn.functional.pad((known / (1 + allowed)).nan_to_num(torch.inf), (1, 1, 1, 1), value=torch.inf)
@@ -91,6 +104,7 @@ def prepare(depth_z: Tensor, T_cam_world: Tensor, K: Tensor, usable: Tensor, *, 
         K=K,
         allowed=allowed,
         barrier=torch.where(barrier.isinf(), 0.0, barrier),
+        inside=inside,
     )
 
 
@@ -134,6 +148,8 @@ def look_up(surfaces: Surfaces, source: int, target: int) -> Lookup:
     pixel = torch.where(asked[..., None], there.pixel, 0.0)
     column, row = (pixel + 0.5).floor().long().unbind(-1)
     nearest = row * width + column
+    if surfaces.inside is not None:
+        asked = asked & surfaces.inside[target].flatten()[nearest]
     difference = surfaces.depth_z[target].flatten()[nearest] / there.depth_z - 1
     difference = torch.where(asked, difference, torch.nan)
     # The barrier between the pixels (u, v) and (u + 1, v + 1) has the index (u + 1, v + 1).

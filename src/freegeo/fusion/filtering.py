@@ -30,7 +30,7 @@ class FilterReport:
 
     pixels: int
     removed: Mapping[str, int]
-    """Of `invalid depth`, `mask`, `sky`, `confidence`, `flying`, `multi-view`: those that ran."""
+    """Of `outside the photo`, `invalid depth`, `mask`, `sky`, `confidence`, `flying`, `multi-view`: those that ran."""
     tolerance: float | None
     """Relative depth tolerance of the multi-view filter; None when it did not run."""
 
@@ -54,6 +54,7 @@ def filter_pixels(
     *,
     sky: np.ndarray | None = None,
     masks: np.ndarray | None = None,
+    inside: np.ndarray | None = None,
     settings: FilterSettings | None = None,
 ) -> tuple[np.ndarray, FilterReport]:
     """Decide which pixels to keep.
@@ -65,6 +66,8 @@ def filter_pixels(
         K: (S, 3, 3) pixels of the maps.
         sky: (S, H, W), or None when the model does not give it.
         masks: (S, H, W) bool, true where the user wants points; None: everywhere.
+        inside: (S, H, W) bool, false where the image is padding; None: no padding. Padding counts as not seen by its
+            view: it has no depth, and no vote on points that fall into it.
         settings: default `FilterSettings()`.
 
     Returns:
@@ -78,6 +81,9 @@ def filter_pixels(
     if masks is not None and masks.shape != depth_z.shape:
         raise UserError(f"Masks of the shape {masks.shape} do not fit depth maps of the shape {depth_z.shape}.")
     keep = torch.ones(depth.shape, dtype=torch.bool)
+    padded = inside is not None and not inside.all()
+    within = torch.from_numpy(np.ascontiguousarray(inside)) if padded else keep
+    depth = torch.where(within, depth, torch.nan)
     removed: dict[str, int] = {}
 
     def apply(name: str, passed: Tensor) -> None:
@@ -86,6 +92,8 @@ def filter_pixels(
         keep = keep & passed
         removed[name] = before - int(keep.sum())
 
+    if padded:
+        apply("outside the photo", within)
     apply("invalid depth", valid_depth(depth))
     if masks is not None:
         apply("mask", torch.from_numpy(np.ascontiguousarray(masks)).bool())
@@ -99,21 +107,27 @@ def filter_pixels(
     tolerance = None
     if settings.multi_view and len(depth) > 1:
         tolerance = settings.tolerance or tolerance_of(depth, T, intrinsics, keep)
-        apply("multi-view", _confirmed(depth, T, intrinsics, keep, tolerance, settings))
+        apply("multi-view", _confirmed(depth, T, intrinsics, keep, within, tolerance, settings))
     return keep.numpy(), FilterReport(pixels=depth.numel(), removed=removed, tolerance=tolerance)
 
 
 def _confirmed(
-    depth_z: Tensor, T_cam_world: Tensor, K: Tensor, usable: Tensor, tolerance: float, settings: FilterSettings
+    depth_z: Tensor,
+    T_cam_world: Tensor,
+    K: Tensor,
+    usable: Tensor,
+    inside: Tensor,
+    tolerance: float,
+    settings: FilterSettings,
 ) -> Tensor:
     """Mask of the usable pixels that the other views do not outvote.
 
     A contradiction counts against both pixels involved, so clear cases (two votes more against than for) are removed
     first, and the votes on the rest are counted without them.
     """
-    votes = vote(prepare(depth_z, T_cam_world, K, usable, tolerance=tolerance))
+    votes = vote(prepare(depth_z, T_cam_world, K, usable, tolerance=tolerance, inside=inside))
     usable = usable & (votes.contradict - votes.agree < 2)
-    votes = vote(prepare(depth_z, T_cam_world, K, usable, tolerance=tolerance))
+    votes = vote(prepare(depth_z, T_cam_world, K, usable, tolerance=tolerance, inside=inside))
     silent = (votes.agree < settings.min_agreeing) & (votes.asked >= settings.min_asked)
     return usable & (votes.contradict <= votes.agree) & ~silent
 

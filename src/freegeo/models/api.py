@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from freegeo.errors import UserError
-from freegeo.models.spec import LoadedFrom, ModelSpec
+from freegeo.models.spec import MIXED, LoadedFrom, Mixed, ModelSpec
 from freegeo.types import Cameras, Features, ImageBatch, PhotoLike, Prediction, ViewTokens
 
 Want = Literal["depth", "cameras", "rays", "points"]
@@ -30,8 +30,8 @@ class ReconstructionModel(nn.Module, ABC):
     """Module that adapter files of the method's authors name layers relative to; empty: the model itself."""
 
     @abstractmethod
-    def preprocess(self, photos: Sequence[PhotoLike]) -> ImageBatch:
-        """Resize and crop photos as the model was trained; UserError when a photo cannot be used."""
+    def preprocess(self, photos: Sequence[PhotoLike], *, mixed: Mixed = MIXED) -> ImageBatch:
+        """Resize photos as the model was trained, to one size by the rule `mixed`; UserError for an unusable photo."""
 
     @abstractmethod
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import torch
 from torch import Tensor
 
 from freegeo.errors import UserError
 from freegeo.geometry.resample import resize_area, resize_cubic
-from freegeo.models.images import Size, to_batch
+from freegeo.models.images import Size, images_of_one_size, require_a_patch
+from freegeo.models.spec import MIXED, Mixed
 from freegeo.types import ImageBatch, PhotoLike
 
 Step = Literal["none", "area", "cubic"]
@@ -31,7 +31,8 @@ class SizePlan:
 
 
 def plan_size(photo: Size, side: int, patch: int) -> SizePlan:
-    """Compute the sizes for one photo; UserError when it is too narrow to give one patch."""
+    """Compute the sizes for one photo; UserError when it is too small or too narrow to give one patch."""
+    require_a_patch(photo, patch)
     longest = max(photo)
     bounded = (max(1, round(photo[0] * side / longest)), max(1, round(photo[1] * side / longest)))
     rows, columns = ((n + patch // 2) // patch * patch for n in bounded)
@@ -67,18 +68,13 @@ def _resized(pixels_HW3: Tensor, size: Size, step: Step) -> Tensor:
     return resize_area(pixels_HW3, size) if step == "area" else resize_cubic(pixels_HW3, size)
 
 
-def preprocess(photos: Sequence[PhotoLike], *, side: int, patch: int) -> ImageBatch:
-    """Read and resize photos; photos that end up with different sizes are centre-cropped to the smallest sides."""
+def preprocess(photos: Sequence[PhotoLike], *, side: int, patch: int, mixed: Mixed = MIXED) -> ImageBatch:
+    """Read and resize photos; upstream cuts photos that end up with different sizes to the smallest sides."""
     plans = [_plan_photo(photo, side, patch) for photo in photos]
-    height, width = (min(plan.final[k] for plan in plans) for k in (0, 1))
-    cropped, offsets = [], []
-    for photo, plan in zip(photos, plans, strict=True):
-        pixels = apply_plan(torch.from_numpy(photo.read()), plan)
-        top, left = (plan.final[0] - height) // 2, (plan.final[1] - width) // 2
-        cropped.append(pixels[top : top + height, left : left + width])
-        offsets.append([-float(left), -float(top)])
-    scales = [[plan.final[1] / plan.photo[1], plan.final[0] / plan.photo[0]] for plan in plans]
-    return to_batch(photos, cropped, scale_xy=scales, offset_xy=offsets)
+    return images_of_one_size(
+        photos, [plan.final for plan in plans], lambda pixels, number: apply_plan(pixels, plans[number]), mixed=mixed,
+        upstream="smallest",
+    )  # fmt: skip
 
 
 def _plan_photo(photo: PhotoLike, side: int, patch: int) -> SizePlan:

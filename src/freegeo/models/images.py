@@ -1,18 +1,99 @@
-"""What every model here does with images: normalisation, the patch grid, and the mapping back to the photos."""
+"""What every model here does with images: one size for all, the mapping back to the photos, patches, normalisation."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Literal, get_args
 
 import torch
 from torch import Tensor
 
+from freegeo.errors import UserError
+from freegeo.geometry.resample import resize_area, resize_cubic
+from freegeo.models.spec import MIXED, Mixed
 from freegeo.types import ImageBatch, PhotoLike
 
+if TYPE_CHECKING:
+    from freegeo.models.api import ReconstructionModel
+
+logger = logging.getLogger(__name__)
+
 Size = tuple[int, int]
+"""Height and width."""
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
+WHITE = 255
+CUT_WORTH_A_WARNING = 0.1
+"""Share of a photo's area that may be cut without a word."""
+ONE_SHAPE = 0.02
+"""Largest relative difference of aspects that counts as one shape."""
+ENLARGED_WORTH_A_WARNING = 2.0
+"""Factor up to which photos may be enlarged without a word."""
+
+
+def read_photos(model: ReconstructionModel, photos: Sequence[PhotoLike], *, mixed: Mixed = MIXED) -> ImageBatch:
+    """Preprocess photos for a model, and warn where the model sees much less than they show.
+
+    Raises:
+        UserError: an unknown rule `mixed`, or a photo that cannot be used.
+    """
+    if mixed not in get_args(Mixed):
+        raise UserError(f"mixed is one of {', '.join(get_args(Mixed))}, not {mixed!r}.")
+    batch = model.preprocess(photos, mixed=mixed)
+    for sentence in (_cut_sentence(batch, mixed), _enlarged_sentence(batch)):
+        if sentence:
+            logger.warning(sentence)
+    return batch
+
+
+def _cut_sentence(batch: ImageBatch, mixed: Mixed) -> str | None:
+    """Say which photos are cut, by how much, and, where one photo causes it, by which."""
+    cut = 1 - batch.seen_share()
+    count = int((cut > CUT_WORTH_A_WARNING).sum())
+    if not count:
+        return None
+    worst, most = _described(batch, int(cut.argmax())), f"{100 * float(cut.max()):.0f} %"
+    size = f"{batch.image_hw[1]} x {batch.image_hw[0]}"
+    aspect = (batch.photo_hw[:, 1] / batch.photo_hw[:, 0]).log()
+    oddness = (aspect - aspect.median()).abs()
+    if oddness.max() < ONE_SHAPE:
+        return f"the model reads the middle of the photos only, at {size}: {most} of each is cut."
+    if mixed == "upstream":
+        odd = _described(batch, int(oddness.argmax()))
+        return f"{odd} makes all photos {size}: up to {most} of each is cut; take it out, or use --mixed crop or pad."
+    instead = "" if mixed == "pad" else ", or use --mixed pad"
+    if count == 1:
+        return f"{worst} has another shape than the rest: {most} of it is cut; take it out{instead}."
+    if 2 * count <= len(batch):
+        return (
+            f"{count} of {len(batch)} photos have another shape than the rest: up to {most} of each is cut, most of "
+            f"{worst}; take them out{instead}."
+        )
+    return (
+        f"the photos have different shapes and are all read at {size}: up to {most} of each is cut, most of {worst}; "
+        f"sort them by shape{instead}."
+    )
+
+
+def _enlarged_sentence(batch: ImageBatch) -> str | None:
+    """Say which photos are much smaller than what the model reads."""
+    factor = batch.scale_xy.amax(-1)
+    views = (factor > ENLARGED_WORTH_A_WARNING).nonzero()[:, 0].tolist()
+    if not views:
+        return None
+    least = _described(batch, int(factor.argmax()))
+    which = least if len(views) == 1 else f"{len(views)} of {len(batch)} photos (the smallest is {least})"
+    return (
+        f"{which} must be enlarged up to {float(factor.max()):.1f} times for the model, which adds no detail; use the "
+        "originals if these are previews."
+    )
+
+
+def _described(batch: ImageBatch, view: int) -> str:
+    height, width = batch.photo_hw[view].tolist()
+    return f"{batch.names[view]} ({width} x {height})"
 
 
 def normalise(images: Tensor) -> Tensor:
@@ -30,18 +111,97 @@ def patch_grid(images: Tensor, patch: int) -> Size:
     return height // patch, width // patch
 
 
-def to_batch(
+def require_a_patch(photo: Size, patch: int) -> None:
+    """Raise UserError for a photo that has fewer pixels on a side than one patch."""
+    if min(photo) < patch:
+        raise UserError(
+            f"a photo of {photo[1]} x {photo[0]} pixels is too small or too narrow: the model reads patches of "
+            f"{patch} x {patch} pixels. Use a larger photo or crop it to a less extreme aspect."
+        )
+
+
+def images_of_one_size(
     photos: Sequence[PhotoLike],
-    pixels_HW3: Sequence[Tensor],
+    sizes: Sequence[Size],
+    resize: Callable[[Tensor, int], Tensor],
     *,
-    scale_xy: Sequence[Sequence[float]],
-    offset_xy: Sequence[Sequence[float]],
+    mixed: Mixed,
+    upstream: Literal["smallest", "largest"],
 ) -> ImageBatch:
-    """Put resized 8-bit photos of one size into a batch, with each photo's scale and offset (x first)."""
+    """Read photos, resize them, and cut or pad them, with the photo in the middle, to one size.
+
+    Args:
+        photos: what is read.
+        sizes: what the model makes of each photo alone: whole patches.
+        resize: resizes photo number i (H, W, 3) uint8 to `sizes[i]`.
+        mixed: how one size comes about.
+        upstream: what the authors' rule takes of the heights and of the widths.
+    """
+    smallest, largest = ((choose(h for h, _ in sizes), choose(w for _, w in sizes)) for choose in (min, max))
+    targets = list(sizes)
+    if mixed == "crop":
+        common = common_size([photo.size_hw for photo in photos], [*sizes, smallest])
+        targets = [
+            own if own == common else _covering(photo.size_hw, common) for photo, own in zip(photos, sizes, strict=True)
+        ]
+    else:
+        common = largest if mixed == "pad" or upstream == "largest" else smallest
+    images, offsets = [], []
+    for number, (photo, own, target) in enumerate(zip(photos, sizes, targets, strict=True)):
+        pixels = torch.from_numpy(photo.read())
+        pixels = resize(pixels, number) if target == own else _resized(pixels, target)
+        top, left = (_offset(common[axis] - target[axis]) for axis in (0, 1))
+        images.append(_placed(pixels, common, top, left).permute(2, 0, 1))
+        offsets.append([float(left), float(top)])
+    heights, widths = torch.tensor(targets).unbind(-1)
+    photo_hw = torch.tensor([photo.size_hw for photo in photos])
     return ImageBatch(
-        images=torch.stack([pixels.permute(2, 0, 1).float() / 255 for pixels in pixels_HW3]),
+        images=torch.stack(images).float() / 255,
         names=tuple(photo.name for photo in photos),
-        photo_hw=torch.tensor([photo.size_hw for photo in photos]),
-        scale_xy=torch.tensor(scale_xy, dtype=torch.float64),
-        offset_xy=torch.tensor(offset_xy, dtype=torch.float64),
+        photo_hw=photo_hw,
+        scale_xy=torch.stack((widths, heights), dim=-1).double() / photo_hw.flip(-1),
+        offset_xy=torch.tensor(offsets, dtype=torch.float64),
     )
+
+
+def common_size(photos: Sequence[Size], sizes: Sequence[Size]) -> Size:
+    """Return the one of `sizes` to which photos are best cut, the first one of equals.
+
+    Of a photo of another aspect so much is cut as the ratio of the aspects lacks to 1. The sum of the squares decides:
+    it fits one odd photo to the others, and lets as many portraits as landscapes meet in a square.
+    """
+
+    def lost(size: Size) -> float:
+        ratios = [photo[1] * size[0] / (photo[0] * size[1]) for photo in photos]
+        return sum((1 - min(ratio, 1 / ratio)) ** 2 for ratio in ratios)
+
+    return min(dict.fromkeys(sizes), key=lost)
+
+
+def _covering(photo: Size, common: Size) -> Size:
+    """Return the smallest size of a photo that covers the common size."""
+    scale = max(side / own for side, own in zip(common, photo, strict=True))
+    height, width = (max(side, round(own * scale)) for side, own in zip(common, photo, strict=True))
+    return height, width
+
+
+def _resized(pixels_HW3: Tensor, size: Size) -> Tensor:
+    shrinks = all(new <= old for new, old in zip(size, pixels_HW3.shape[:2], strict=True))
+    return resize_area(pixels_HW3, size) if shrinks else resize_cubic(pixels_HW3, size)
+
+
+def _offset(room: int) -> int:
+    """Return where a photo begins that has `room` around it; negative where it is larger than the image.
+
+    The odd row or column of a border is at its end, and so is the one that is cut.
+    """
+    return room // 2 if room >= 0 else -(-room // 2)
+
+
+def _placed(pixels_HW3: Tensor, size: Size, top: int, left: int) -> Tensor:
+    """Put pixels on a white area, cutting what lies outside it."""
+    cut = pixels_HW3[max(-top, 0) :, max(-left, 0) :][: size[0], : size[1]]
+    top, left = max(top, 0), max(left, 0)
+    area = cut.new_full((*size, 3), WHITE)
+    area[top : top + cut.shape[0], left : left + cut.shape[1]] = cut
+    return area

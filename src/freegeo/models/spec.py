@@ -10,6 +10,14 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from freegeo.models.api import ReconstructionModel
 
+Mixed = Literal["crop", "pad", "upstream"]
+"""How photos of different shapes become images of one size; the network sees all views in one pass.
+
+`crop`: the size that loses least, mostly that of most photos; those of another shape are scaled to cover it and cut.
+`pad`: the largest height and width; nothing is cut, and white fills the rest. `upstream`: the authors' rule.
+"""
+MIXED: Mixed = "crop"
+
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptationDefaults:

@@ -22,7 +22,7 @@ from freegeo.models import vggt_images
 from freegeo.models.api import ReconstructionModel, Want, check_layers, check_want, level_tokens
 from freegeo.models.dpt import DenseHead, confidence, depth_maps, read_in_chunks
 from freegeo.models.images import normalise, patch_grid
-from freegeo.models.spec import ModelSpec
+from freegeo.models.spec import MIXED, Mixed, ModelSpec
 from freegeo.models.transformer import (
     Block,
     Mlp,
@@ -194,9 +194,10 @@ class VGGT(ReconstructionModel):
             for name in block_linears(f"aggregator.{kind}.{i}", block)
         ]
 
-    def preprocess(self, photos: Sequence) -> ImageBatch:
+    def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED) -> ImageBatch:
         """Resize to the default longest side, the aspect kept up to whole patches, as in the benchmark."""
-        return vggt_images.preprocess(photos, side=self.spec.default_side, patch=self.config.patch_size)
+        side, patch = self.spec.default_side, self.config.patch_size
+        return vggt_images.preprocess(photos, side=side, patch=patch, mixed=mixed)
 
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:
         """Run the patch encoder on images (B, S, 3, H, W) in [0, 1].

@@ -11,10 +11,9 @@ from torch import Tensor
 
 from freegeo.errors import UserError
 from freegeo.geometry.resample import resize_area, resize_cubic
-from freegeo.models.images import Size, to_batch
+from freegeo.models.images import Size, images_of_one_size, require_a_patch
+from freegeo.models.spec import MIXED, Mixed
 from freegeo.types import ImageBatch, PhotoLike
-
-WHITE = 255
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,11 +27,7 @@ class SizePlan:
 
 def plan_size(photo: Size, side: int, patch: int) -> SizePlan:
     """Compute the size for one photo; UserError when it would not fill a patch."""
-    if min(photo) < patch:
-        raise UserError(
-            f"a photo of {photo[1]} x {photo[0]} pixels is too small or too narrow: the model reads patches of "
-            f"{patch} x {patch} pixels. Use a larger photo or crop it to a less extreme aspect."
-        )
+    require_a_patch(photo, patch)
     scale = side / max(photo)
     rows, columns = (max(patch, round(round(n * scale) / patch) * patch) for n in photo)
     return SizePlan(photo=photo, resized=(rows, columns), step="area" if scale <= 1 else "cubic")
@@ -43,19 +38,13 @@ def apply_plan(pixels_HW3: Tensor, plan: SizePlan) -> Tensor:
     return (_resize_area if plan.step == "area" else resize_cubic)(pixels_HW3, plan.resized)
 
 
-def preprocess(photos: Sequence[PhotoLike], *, side: int, patch: int) -> ImageBatch:
-    """Read and resize photos; sizes that differ in the end are padded, white and centred, to the largest sides."""
+def preprocess(photos: Sequence[PhotoLike], *, side: int, patch: int, mixed: Mixed = MIXED) -> ImageBatch:
+    """Read and resize photos; upstream pads photos that end up with different sizes to the largest sides."""
     plans = [_plan_photo(photo, side, patch) for photo in photos]
-    height, width = (max(plan.resized[k] for plan in plans) for k in (0, 1))
-    padded, offsets = [], []
-    for photo, plan in zip(photos, plans, strict=True):
-        pixels = apply_plan(torch.from_numpy(photo.read()), plan)
-        # The odd row or column of a border goes to its end.
-        top, left = (height - plan.resized[0]) // 2, (width - plan.resized[1]) // 2
-        padded.append(_padded(pixels, (height, width), top, left))
-        offsets.append([float(left), float(top)])
-    scales = [[plan.resized[1] / plan.photo[1], plan.resized[0] / plan.photo[0]] for plan in plans]
-    return to_batch(photos, padded, scale_xy=scales, offset_xy=offsets)
+    return images_of_one_size(
+        photos, [plan.resized for plan in plans], lambda pixels, number: apply_plan(pixels, plans[number]), mixed=mixed,
+        upstream="largest",
+    )  # fmt: skip
 
 
 def _plan_photo(photo: PhotoLike, side: int, patch: int) -> SizePlan:
@@ -63,13 +52,6 @@ def _plan_photo(photo: PhotoLike, side: int, patch: int) -> SizePlan:
         return plan_size(photo.size_hw, side, patch)
     except UserError as error:
         raise UserError(f"{photo.name}: {error}") from None
-
-
-def _padded(pixels_HW3: Tensor, size: Size, top: int, left: int) -> Tensor:
-    height, width = pixels_HW3.shape[:2]
-    area = pixels_HW3.new_full((*size, 3), WHITE)
-    area[top : top + height, left : left + width] = pixels_HW3
-    return area
 
 
 def _resize_area(pixels_HW3: Tensor, size: Size) -> Tensor:

@@ -195,7 +195,7 @@ def _valid(depth_z: np.ndarray) -> np.ndarray:
 def _stage(
     key: str, value: Reconstruction, reference: Reconstruction, truth: Reconstruction | None, folder: Path
 ) -> Stage:
-    keep, removed = _valid(value.depth_z), {}
+    keep, removed = _valid(value.depth_z) & value.inside(), {}
     if value.has_cameras:
         # Filtered here only where no command did, as after `Reconstruction.save`.
         keep, report = load_kept(folder, value.depth_z.shape) or filter_reconstruction(value)

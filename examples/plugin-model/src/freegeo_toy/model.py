@@ -15,7 +15,7 @@ from freegeo.geometry.se3 import inverse
 from freegeo.models.api import ReconstructionModel, Want, check_layers, check_want, level_tokens
 from freegeo.models.da3_images import preprocess
 from freegeo.models.images import normalise, patch_grid
-from freegeo.models.spec import AdaptationDefaults, ModelSpec
+from freegeo.models.spec import MIXED, AdaptationDefaults, Mixed, ModelSpec
 from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
 from freegeo_toy import LICENCE
 
@@ -62,9 +62,9 @@ class Toy(ReconstructionModel):
         self.read_depth = nn.Linear(WIDTH, 2 * PATCH**2)
         self.read_camera = nn.Linear(WIDTH, 9)
 
-    def preprocess(self, photos: Sequence) -> ImageBatch:
+    def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED) -> ImageBatch:
         """Resize the longest side to 64 pixels, both sides to multiples of 8."""
-        return preprocess(photos, side=SIDE, patch=PATCH)
+        return preprocess(photos, side=SIDE, patch=PATCH, mixed=mixed)
 
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:
         """See each view alone: images (B, S, 3, H, W) in [0, 1]."""

@@ -21,6 +21,7 @@ from freegeo.adaptation.losses.sampling import (
     anchor_tokens,
     cross_tokens,
     intra_special,
+    positions_of,
 )
 from freegeo.adaptation.recipe import LossConfig
 from freegeo.errors import FreeGeoError
@@ -34,6 +35,7 @@ def adaptation_loss(
     config: LossConfig,
     *,
     form: KLForm | None = None,
+    patches: Tensor | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The total loss of one step (scalar, float32 or wider) and its detached terms.
 
@@ -45,6 +47,7 @@ def adaptation_loss(
         draws: token positions, on any device; on the features' device they need not be copied.
         config: which version of the loss.
         form: see `all_pairs_divergence`; only `pairing` "all" uses it, and None costs a transfer to the host per term.
+        patches: (M, P) bool, on the CPU: patches of the kept views that the intra loss compares; None: all.
 
     Terms: `total`; `intra` (weighted) and its unweighted parts `huber` and `cos` (mean of 1 - cosine); `cross`
     (weighted); unweighted `phi1`, `phi2`, `phi3` (angles at reference, anchor, query) and `phi` (weighted sum);
@@ -56,7 +59,7 @@ def adaptation_loss(
             f"The student's features come from layers {sorted(student_levels)}, the teacher's from "
             f"{sorted(teacher_levels)}; ask both branches for the same layers."
         )
-    total, terms = feature_distance(student_levels, teacher_levels, config)
+    total, terms = feature_distance(student_levels, teacher_levels, config, patches=patches)
     cross: list[Tensor] = []
     if config.uses_angles or config.uses_distances:
         layer = max(student_levels)
@@ -87,12 +90,22 @@ def adaptation_loss(
 
 
 def feature_distance(
-    student_levels: Mapping[int, Level], teacher_levels: Mapping[int, Level], config: LossConfig
+    student_levels: Mapping[int, Level],
+    teacher_levels: Mapping[int, Level],
+    config: LossConfig,
+    *,
+    patches: Tensor | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The intra loss of features against the teacher's of the same views, mean over layers, and its parts as above."""
+    """The intra loss of features against the teacher's of the same views, mean over layers, and its parts as above.
+
+    `patches` (views, P) bool, on the CPU: those that show a photo and are compared; None: all.
+    """
     per_layer = []
     for layer, (patch, special) in student_levels.items():
         teacher_patch, teacher_special = teacher_levels[layer]
+        if patches is not None:
+            chosen = positions_of(patches, patch.device)
+            patch, teacher_patch = (t.flatten(1, 2).index_select(1, chosen)[:, None] for t in (patch, teacher_patch))
         pairs = [(patch, teacher_patch), (intra_special(config, special), intra_special(config, teacher_special))]
         per_layer.append(
             intra_loss(

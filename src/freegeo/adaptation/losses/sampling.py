@@ -31,17 +31,30 @@ def cross_tokens(config: LossConfig, level: Level) -> Tensor:
     return torch.cat([special, patch], dim=-2) if config.cross_tokens == "all" else patch
 
 
-def held_out_tokens(level: Level, kept: Sequence[int], config: LossConfig) -> Tensor:
+def held_out_tokens(level: Level, kept: Sequence[int], config: LossConfig, *, patches: Tensor | None = None) -> Tensor:
     """The tokens (B, L, C) that anchors are chosen from: those of the views that the student does not see.
 
-    level: the teacher's features of the cross layer, all N views; kept: the student's views among them. UserError
-    where the student sees every view.
+    level: the teacher's features of the cross layer, all N views; kept: the student's views among them; patches (N, P)
+    bool: those that show a photo, None: all. UserError where the student sees every view.
     """
     tokens = cross_tokens(config, level)
     views = [view for view in range(tokens.shape[1]) if view not in set(kept)]
     if not views:
         raise UserError("The student keeps every view of the teacher; hold out at least one for the anchors.")
-    return tokens[:, views].flatten(1, 2)
+    held_out = tokens[:, views].flatten(1, 2)
+    if patches is None:
+        return held_out
+    return held_out.index_select(1, positions_of(_cross_mask(patches[views], tokens.shape[2]), held_out.device))
+
+
+def positions_of(mask: Tensor, device: torch.device) -> Tensor:
+    """Flat positions (n,) of the true values of a mask on the CPU."""
+    return mask.flatten().nonzero()[:, 0].to(device)
+
+
+def _cross_mask(patches: Tensor, tokens_per_view: int) -> Tensor:
+    """Extend a mask of patches (S, P) to the tokens (S, T) of `cross_tokens`: special tokens always take part."""
+    return F.pad(patches, (tokens_per_view - patches.shape[1], 0), value=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,12 +95,21 @@ class StepDraws:
 
 
 def draw_tokens(
-    config: LossConfig, *, tokens_per_view: int, student_views: int, held_out_views: int, generator: torch.Generator
+    config: LossConfig,
+    *,
+    tokens_per_view: int,
+    student_views: int,
+    held_out_views: int,
+    generator: torch.Generator,
+    patches: Tensor | None = None,
+    held_out_count: int | None = None,
 ) -> StepDraws:
     """Draw the references and queries of one step (CPU tensors).
 
     tokens_per_view: tokens that `config.cross_tokens` lets take part (patches, or special tokens and patches).
-    Where a view has fewer tokens than asked for, all are drawn. The generator is read in this order: references,
+    Where a view has fewer tokens than asked for, all are drawn. `patches` (M, P) bool, on the CPU, are those of the
+    student's views that show a photo, and `held_out_count` the number of such tokens of the held-out views; only these
+    are drawn. None: all. The generator is read in this order: references,
     queries and, for random selection, anchors of the angle draw; then the same for a separate distance draw.
     Raises `UserError` where the views cannot form a triplet.
     """
@@ -101,23 +123,37 @@ def draw_tokens(
             f"The relational loss needs 2 kept views and 1 held-out view, not {student_views} and {held_out_views}; "
             "use at least 3 views."
         )
-    sizes = (tokens_per_view, student_views - 1, held_out_views)
-    angle = _draw(config, *sizes, generator)
-    return StepDraws(angle=angle, distance=_draw(config, *sizes, generator) if config.separate_draws else angle)
-
-
-def _draw(config: LossConfig, tokens: int, other_views: int, held_out: int, generator: torch.Generator) -> TokenDraw:
-    reference = torch.randperm(tokens, generator=generator)[: config.num_reference]
-    if config.queries == "pooled":
-        query = torch.randperm(other_views * tokens, generator=generator)[None, : config.num_query]
+    if patches is None:
+        seen = torch.ones(student_views, tokens_per_view, dtype=torch.bool)
     else:
-        positions = torch.randperm(tokens, generator=generator)[: config.num_query]
-        query = positions + tokens * torch.arange(other_views)[:, None]
+        seen = _cross_mask(patches, tokens_per_view)
+    held_out = held_out_views * tokens_per_view if held_out_count is None else held_out_count
+    angle = _draw(config, seen, held_out, generator)
+    return StepDraws(angle=angle, distance=_draw(config, seen, held_out, generator) if config.separate_draws else angle)
+
+
+def _draw(config: LossConfig, seen: Tensor, held_out: int, generator: torch.Generator) -> TokenDraw:
+    """Draw among the tokens (M, T) that are seen, and from `held_out` tokens of the other views."""
+    others = torch.cat([seen[: config.reference_view], seen[config.reference_view + 1 :]])
+    reference = _some(seen[config.reference_view], config.num_reference, generator)
+    if config.queries == "pooled":
+        query = _some(others.flatten(), config.num_query, generator)[None]
+    else:
+        # The same positions in every view, so only what all of them show.
+        query = _some(others.all(0), config.num_query, generator) + seen.shape[1] * torch.arange(len(others))[:, None]
+    if not (reference.numel() and query.numel() and held_out):
+        raise UserError("The photos of a view set show no patch in common: all is padding. Adapt with --mixed crop.")
     anchor = None
     if config.selection == "random":
         shape = (len(reference), config.num_anchors)
-        anchor = torch.randint(held_out * tokens, shape, generator=generator)
+        anchor = torch.randint(held_out, shape, generator=generator)
     return TokenDraw(reference=reference, query=query, anchor=anchor)
+
+
+def _some(seen: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Draw up to `count` different positions of the true values of a mask (n,)."""
+    positions = seen.nonzero()[:, 0]
+    return positions[torch.randperm(len(positions), generator=generator)[:count]]
 
 
 @torch.no_grad()
