@@ -25,7 +25,7 @@ def test_a_cut_photo_is_said_in_log_summary_and_report(freegeo, with_portrait, t
     assert outcome.code == 0
     assert f"warning: {sentence} --mixed pad." in outcome.err.splitlines()
     summary = json.loads((tmp_path / "out" / "reconstruction.json").read_text(encoding="utf-8"))
-    assert summary["warnings"] == [f"{sentence} --mixed pad."]
+    assert f"{sentence} --mixed pad." in summary["warnings"]
     assert sentence in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     result = Reconstruction.load(tmp_path / "out")
     assert result.image_hw == (48, 64)
