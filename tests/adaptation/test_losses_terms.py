@@ -99,6 +99,74 @@ def test_zero_length_sides_give_cosine_zero_and_no_gradient(dtype):
         assert (mine.double() - plain).norm() <= tolerance * plain.norm()
 
 
+def near_duplicates(distance, channels, seed=0):
+    """Tokens (student, teacher, anchors) in float32, all of one position of the scene, `distance` of their norm apart.
+
+    Their common part is large, as in the features of a vision transformer.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    scene = torch.randn(1, 6, channels, generator=generator) + 3 * torch.randn(channels, generator=generator)
+
+    def near(tokens):
+        return tokens + distance * tokens.norm() / tokens.numel() ** 0.5 * torch.randn(
+            tokens.shape, generator=generator
+        )
+
+    return (near(scene), near(scene)), (scene, near(scene)), torch.stack([near(scene), near(scene)], dim=2)
+
+
+def angles_and_definition(student, teacher, k, delta=1.0):
+    """Terms and gradients of float32 tokens, and the same from the definition in float64."""
+    inputs = tuple(part.requires_grad_() for part in student)
+    found, terms = angle_loss(inputs, teacher, k, weights=(1.0, 1.0, 1.0), penalty="huber", huber_delta=delta)
+    wide = tuple(part.detach().double().requires_grad_() for part in inputs)
+    means = angle_means(wide, tuple(part.double() for part in teacher), k.double(), delta)
+    return (terms.double(), gradients(found, inputs)), (means.detach(), gradients(means.sum(), wide))
+
+
+@pytest.mark.parametrize("channels", [64, 3072])
+@pytest.mark.parametrize("distance", [1e-1, 1e-2, 2e-3, 1e-3, 1e-4, 1e-5])
+def test_angles_between_near_duplicate_views_are_exact_in_float32(distance, channels):
+    # 2 eps / delta^2 (docs/method.md, "Angle terms by matrix products"), and the rounding of the result to float32.
+    tolerance = 1e-6 + 8 * torch.finfo(FLOAT64).eps / distance**2
+    found, wanted = angles_and_definition(*near_duplicates(distance, channels))
+    torch.testing.assert_close(found[0], wanted[0], rtol=tolerance, atol=0)
+    for mine, plain in zip(found[1], wanted[1], strict=True):
+        assert mine.dtype == torch.float32
+        assert (mine.double() - plain).norm() <= tolerance * plain.norm()
+
+
+def test_a_single_short_side_among_long_ones_keeps_its_angles():
+    student, teacher, k = random_triplets(batch=1, channels=64, dtype=torch.float32)
+    for p, q in (student, teacher):
+        q[:, 0] = p[:, 0] * (1 + 1e-4 * torch.linspace(-1, 1, 64))
+    found, wanted = angles_and_definition(student, teacher, k)
+    torch.testing.assert_close(found[0], wanted[0], rtol=1e-6, atol=0)
+
+
+def test_a_difference_in_the_last_bits_of_float32_tokens_is_not_zero():
+    p = 1 + torch.rand(1, 1, 512, generator=torch.Generator().manual_seed(0))
+    bits = 16 * torch.where(torch.arange(512) % 3 == 0, 1, -1).int()
+    q = (p.view(torch.int32) + bits).view(torch.float32)
+    k, other = torch.randn(2, 1, 1, 512, generator=torch.Generator().manual_seed(1))
+    found, wanted = angles_and_definition((p, q), (p.clone(), other), k[:, None])
+    torch.testing.assert_close(found[0], wanted[0], rtol=1e-3, atol=0)
+    without, _ = angles_and_definition((p.detach(), p.detach().clone()), (p.detach().clone(), other), k[:, None])
+    assert (without[0] - wanted[0]).abs().max() > 1e-2
+
+
+@pytest.mark.parametrize("channels", [64, 3072])
+def test_equal_tokens_are_a_side_of_length_zero_however_large_their_common_part(channels):
+    (p, _), (teacher_p, _), k = near_duplicates(1e-2, channels)
+    common = 50 * torch.ones(channels)
+    p, teacher_p, k = p + common, teacher_p + common, k + common
+    # Repeated frames: the student's queries are its references, the teacher's are its anchors.
+    found, wanted = angles_and_definition((p, p.clone()), (teacher_p, k[:, :, 0].clone()), k)
+    torch.testing.assert_close(found[0], wanted[0], rtol=1e-5, atol=0)
+    for mine, plain in zip(found[1], wanted[1], strict=True):
+        assert (mine.double() - plain).norm() <= 1e-5 * plain.norm()
+
+
 @pytest.mark.parametrize("form", ["float32", "float64", "direct", None])
 @pytest.mark.parametrize("shared", ["nothing", "x", "y"])
 def test_all_pairs_divergence_equals_its_definition(form, shared):

@@ -36,8 +36,9 @@ ImageSize = tuple[int, int]
 Parts = tuple[tuple[str, int], ...]
 WIDE = 4
 """Bytes of a float32: the residual stream, norms, features, losses, trained parameters."""
-TRIPLET_ARRAYS = 13
-"""Arrays with one number per triplet that exist at the same time while the angle terms are computed."""
+TRIPLET_ARRAYS, EDGE_ARRAYS = 13, 3
+"""Float64 arrays that exist at the same time while the angle terms are computed: with one number per triplet, and with
+one vector per reference and anchor."""
 WIDEST_LEVELS = 4
 """Levels that the dense heads read."""
 
@@ -165,15 +166,17 @@ class Footprint:
         return [("student's pass", left + inputs), max(("losses", losses), ("backward pass", backward), key=_size)]
 
     def _losses(self, tokens: int) -> int:
-        """Bytes of the gradients of all features, four blocks of the intra sweep, and the arrays over triplets."""
+        """Bytes of the gradients of all features, four blocks of the intra sweep, and the arrays of the angle terms."""
         loss = self.recipe.loss
         per_view, others = self.tokens[self.largest.scene], len(self.largest.kept) - 1
         queries = min(loss.num_query, per_view) * (others if loss.queries == "per_view" else 1)
-        triplets = min(loss.num_reference, per_view) * loss.num_anchors * min(queries, others * per_view)
+        edges = min(loss.num_reference, per_view) * loss.num_anchors
+        triplets = edges * min(queries, others * per_view)
         level = WIDE * tokens * self.shape.channels
         on_cpu = self.compute.device.type == "cpu"
         block = WIDE * (CPU_BLOCK_ELEMENTS if on_cpu else DEVICE_BLOCK_ELEMENTS)
-        return level * self.layers + 4 * min(level, block) + TRIPLET_ARRAYS * WIDE * triplets
+        angles = 2 * WIDE * (TRIPLET_ARRAYS * triplets + EDGE_ARRAYS * edges * self.shape.channels)
+        return level * self.layers + 4 * min(level, block) + angles
 
     def _shared_tokens(self) -> int:
         """Tokens of the images that several view sets use, which wait for the last of them."""

@@ -7,13 +7,21 @@ since the squared sides of a triangle give its angles:
     n = (q - p) . (k - p) = u . q - u . p          c = |q - k|^2 = a + b - 2 n
     cosines   n / sqrt(a b)  at p        (b - n) / sqrt(b c)  at k        (a - n) / sqrt(a c)  at q
 
-Why edges, and not k . q for c: an anchor is often close to its reference, and a short side computed as the difference
-of large squared norms loses its precision. The edge u is formed by subtraction, so u, b and n stay precise where it is
-short. For a and c, which still are such differences, two things help. All tokens are centred on a common vector, which
-changes no side but makes the norms small. And where the two tokens of a side are equal (repeated frames), what is left
-of it is rounding, which must not be taken for a direction: `_branch` says below which length a side counts as zero; its
-cosines are 0 and take no gradient. The bound is that of the inputs' type, so the products must be exact
-(`exact_matmul`).
+Why float64, and edges: a and c are differences of large squared norms. Their error is a few eps of these norms, so the
+cosines at a side of delta times the tokens' norm have a relative error of about 2 eps / delta^2. Near-duplicate views
+have many short sides: at delta = 1e-3 that is 1/4 in float32, and 4e-10 in float64 (4e-6 at 1e-5, 4e-4 at 1e-6). So the
+tokens are widened to float64, which rounds nothing, and everything below is computed in it (`doubled`). Two measures
+more cost nothing: the edge u is formed by subtraction, since an anchor is often close to its reference, and all tokens
+are centred on a common vector, which changes no side but makes the norms small.
+
+Where the two tokens of a side are equal (repeated frames), what is left of it is rounding and must not be taken for a
+direction. It depends on the order in which a product adds up its C channels: up to 28 eps of the squared norms were
+measured, for C from 64 to 8192 and large and small products. A side counts as zero where
+
+    a <= 64 eps (|p|^2 + |q|^2) = 2^-46 (|p|^2 + |q|^2),    for tokens of equal norm |q - p| <= 2^-22.5 |p| = 1.7e-7 |p|
+
+and c alike. Float32 numbers are 2^-24 to 2^-23 of their size apart, so the bound is the last bit or two of the features
+themselves: every longer side keeps its angles. A side of length zero has cosine 0 at both of its ends and no gradient.
 
 Loss and gradient come from one sweep over blocks of references that stay in cache; two arrays of R * K * m live during
 the sweep and none after it. Gradients go first to a, b and n (`_by_squares`), then, by further products, to p and q
@@ -28,7 +36,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from freegeo.adaptation.losses.numerics import block_elements, blocks, exact_matmul, widened
+from freegeo.adaptation.losses.numerics import block_elements, blocks, doubled, exact_matmul, widened_type
+
+ZERO_EPS = 64
+"""A squared side counts as zero up to so many eps of the squared norms that it is a difference of."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +74,7 @@ def _inverse_root(square: Tensor) -> Tensor:
 
 
 def _branch(p: Tensor, q: Tensor, k: Tensor, centre: Tensor) -> _Branch:
-    """The two matrix products and which sides have length zero.
-
-    A squared side that comes from products is only known up to rounding, a few eps of the squared norms that went into
-    it. Two tokens that are bitwise equal leave less than 2 eps of that scale, the shortest genuine side measured was
-    above 8e5 eps: 8 eps tells them apart.
-    """
+    """The two matrix products, and which sides have length zero (see above)."""
     u = torch.empty_like(k)
     u_square = k.new_empty(k.shape[:-1])
     for part in blocks(k.shape[1], block_elements(k) // k[:, 0].numel()):
@@ -76,7 +82,7 @@ def _branch(p: Tensor, q: Tensor, k: Tensor, centre: Tensor) -> _Branch:
         u_square[:, part] = u[:, part].square().sum(-1)
     p, q = p - centre, q - centre
     q_columns = q.mT
-    rounding = 8 * torch.finfo(p.dtype).eps
+    rounding = ZERO_EPS * torch.finfo(p.dtype).eps
     p_and_q = p.square().sum(-1)[:, :, None] + q.square().sum(-1)[:, None]
     pq_square = torch.baddbmm(p_and_q, p, q_columns, alpha=-2)
     pq_square = torch.where(pq_square <= rounding * p_and_q, 0, pq_square)
@@ -192,15 +198,20 @@ class _AngleTerms(torch.autograd.Function):
         delta: float | None,
     ) -> tuple[Tensor, Tensor]:
         ctx.dtypes = p.dtype, q.dtype
-        p, q, teacher_p, teacher_q, k = map(widened, (p, q, teacher_p, teacher_q, k))
+        device, dtype = p.device, widened_type(p)
+        p, q, teacher_p, teacher_q, k = map(doubled, (p, q, teacher_p, teacher_q, k))
         centre = torch.cat([teacher_p, teacher_q, k.flatten(1, 2)], dim=1).mean(1, keepdim=True)
         with exact_matmul(p):
             student, teacher = _branch(p, q, k, centre), _branch(teacher_p, teacher_q, k, centre)
             terms, by_squares = _sweep(student, teacher, weights, delta, any(ctx.needs_input_grad[:2]))
-            ctx.save_for_backward(*(_by_tokens(student, *by_squares) if by_squares else ()))
+            gradients = _by_tokens(student, *by_squares) if by_squares else ()
+        # Converted at once: what waits for the backward pass is as small as the tokens.
+        ctx.save_for_backward(*(grad.to(device, dtype) for grad in gradients))
+        loss = torch.stack([weight * term for weight, term in zip(weights, terms, strict=True)]).sum().to(device, dtype)
+        terms = terms.to(device, dtype)
         ctx.mark_non_differentiable(terms)
         ctx.set_materialize_grads(False)
-        return torch.stack([weight * term for weight, term in zip(weights, terms, strict=True)]).sum(), terms
+        return loss, terms
 
     @staticmethod
     @once_differentiable

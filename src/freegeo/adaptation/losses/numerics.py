@@ -1,4 +1,4 @@
-"""How the losses compute: in float32 or wider, with exact matrix products, over blocks that fit in cache.
+"""How the losses compute: in float32 or float64, with exact matrix products, over blocks that fit in cache.
 
 Features may arrive in half precision under autocast. Losses are differences of nearly equal numbers, for which half
 precision and TF32 are too coarse, so every loss widens its inputs and switches both off for its products. The losses
@@ -29,17 +29,27 @@ def blocks(length: int, size: int) -> Iterator[slice]:
         yield slice(start, min(start + step, length))
 
 
+def widened_type(tensor: Tensor) -> torch.dtype:
+    """The type that a loss of `tensor` is given in: float32, or float64 where the tensor has it."""
+    return torch.float64 if tensor.dtype == torch.float64 else torch.float32
+
+
 def widened(tensor: Tensor) -> Tensor:
     """`tensor` in float32, or unchanged where it is float64 already."""
-    return tensor if tensor.dtype == torch.float64 else tensor.float()
+    return tensor.to(widened_type(tensor))
+
+
+def doubled(tensor: Tensor) -> Tensor:
+    """`tensor` in float64; from a device that has no such numbers (Apple GPUs) on the CPU."""
+    return tensor.cpu().double() if tensor.device.type == "mps" else tensor.double()
 
 
 @contextmanager
 def exact_matmul(tensor: Tensor) -> Generator[None]:
     """Matrix products on the device of `tensor` in the full precision of their inputs: no autocast, no TF32.
 
-    A KL value is a small difference of large logarithms, and the rule for sides of length zero (`angles`) assumes the
-    rounding of the inputs' type. TF32 is a global setting; its previous value is restored afterwards.
+    A KL value is a small difference of large logarithms, for which TF32 is too coarse. TF32 is a global setting; its
+    previous value is restored afterwards.
     """
     with torch.autocast(device_type=tensor.device.type, enabled=False):
         if tensor.device.type != "cuda":
