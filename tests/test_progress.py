@@ -74,9 +74,36 @@ def test_steps_are_followed_from_the_first_to_the_last(capsys):
         for step in range(20):
             on_step(Progress(step=step, steps=20, epoch=0, terms={"total": torch.tensor(step / 10)}))
     lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == "adapting: 1/20, loss 0.0000"
-    assert "adapting: 20/20" in lines[-1] and lines[-1].endswith("loss 1.9000")
+    assert lines[0] == "adapting: 1/20, loss 0"
+    # Steps 18 and 19, those since the line before.
+    assert "adapting: 20/20" in lines[-1] and lines[-1].endswith("loss 1.85")
     assert [state.step for state in followed] == list(range(20))
+
+
+def curve_in_a_log(capsys, losses) -> list[str]:
+    """The lines of a run with these losses."""
+    with progress.step_bar() as on_step:
+        for step, loss in enumerate(losses):
+            on_step(Progress(step=step, steps=len(losses), epoch=0, terms={"total": torch.tensor(loss)}))
+    return capsys.readouterr().err.splitlines()
+
+
+@pytest.mark.parametrize("steps", [1, 3, 10, 35, 100, 1000])
+def test_every_line_of_a_log_says_the_loss(capsys, steps):
+    lines = curve_in_a_log(capsys, [0.5] * steps)
+    assert min(steps, 10) <= len(lines) <= 11
+    assert all(line.endswith(", loss 0.5") for line in lines)
+
+
+def test_the_loss_that_is_shown_is_that_of_all_steps_since_the_line_before(capsys):
+    # View sets of unequal losses in turn: single steps would show 1 or 3.
+    lines = curve_in_a_log(capsys, [1.0, 3.0] * 50)
+    assert [line.rpartition("loss ")[2] for line in lines[2:]] == ["2"] * 9
+
+
+def test_losses_that_are_huge_or_not_finite_are_shown_as_they_are(capsys):
+    lines = curve_in_a_log(capsys, [0.5, 1.6e15, float("nan")])
+    assert [line.rpartition("loss ")[2] for line in lines] == ["0.5", "1.6e+15", "nan"]
 
 
 def test_a_run_that_fails_leaves_no_bar_behind(monkeypatch):

@@ -11,3 +11,7 @@ class UserError(FreeGeoError, ValueError):
 
 class PartialResultError(FreeGeoError):
     """Everything was written but for what the sentence names (exit code 3)."""
+
+
+class DivergedError(FreeGeoError):
+    """An adaptation whose loss or gradient is not finite, or has grown beyond recovery: it has no result."""

@@ -13,18 +13,22 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from freegeo.adaptation.adapt import Progress
 
 Update = Callable[..., None]
+LINES = 10
+"""Lines of a whole piece of work in a log file."""
 LOSS_EVERY = 10
-"""Steps between two readings of the loss, each of which waits for the device."""
+"""Most steps between two readings of the loss, each of which waits for the device."""
 
 
 @contextmanager
 def progress_bar(title: str, total: int) -> Generator[Update]:
     """Show how much of `total` is done, with the time left; gives `update(done, text=None)`.
 
-    `text` stands behind the numbers until another one is given.
+    `text` stands behind the numbers until another one is given, in a bar and in lines.
     """
     if not (sys.stderr.isatty() or in_notebook()):
         yield _lines(title, total)
@@ -62,16 +66,23 @@ def progress_bar(title: str, total: int) -> Generator[Update]:
 
 @contextmanager
 def step_bar(then: Callable[[Progress], None] = lambda progress: None) -> Generator[Callable[[Progress], None]]:
-    """Give an `on_step` for `adapt` that shows a bar from the first step to the last, and calls `then` too."""
+    """Give an `on_step` for `adapt` that shows a bar from the first step to the last, and calls `then` too.
+
+    The loss shown is the mean of the steps since it was shown last: single steps are of view sets of unequal losses.
+    """
     with ExitStack() as stack:
         update: Update | None = None
+        unread: list[Tensor] = []
 
         def on_step(progress: Progress) -> None:
             nonlocal update
             update = update or stack.enter_context(progress_bar("adapting", progress.steps))
-            last = progress.step + 1 == progress.steps
-            look = last or progress.step % LOSS_EVERY == 0
-            update(progress.step + 1, f"loss {float(progress.terms['total']):.4f}" if look else None)
+            done, last, text = progress.step + 1, progress.step + 1 == progress.steps, None
+            unread.append(progress.terms["total"])
+            if last or done == 1 or done % min(LOSS_EVERY, max(1, progress.steps // LINES)) == 0:
+                text = f"loss {sum(map(float, unread)) / len(unread):.4g}"
+                unread.clear()
+            update(done, text)
             if last:
                 stack.close()
             then(progress)
@@ -89,18 +100,19 @@ def in_notebook() -> bool:
 
 
 def _lines(title: str, total: int) -> Update:
-    first, shown = None, -1
+    first, shown, known = None, -1, ""
 
     def update(done: int, text: str | None = None) -> None:
-        nonlocal first, shown
+        nonlocal first, shown, known
+        known = known if text is None else text
         # Time and work before the first report, such as an adaptation or an earlier run, do not count for the speed.
         first = first or (done, time.monotonic())
-        tenth = done * 10 // total
+        tenth = done * LINES // total
         if tenth > shown:
             shown = tenth
             gained, seconds = done - first[0], time.monotonic() - first[1]
             left = f", {seconds * (total - done) / gained:.0f} s left" if gained else ""
-            sys.stderr.write(f"{title}: {done}/{total}{left}{', ' + text if text else ''}\n")
+            sys.stderr.write(f"{title}: {done}/{total}{left}{', ' + known if known else ''}\n")
             sys.stderr.flush()
 
     return update

@@ -170,7 +170,8 @@ def test_running_out_of_memory_is_met_once_with_checkpointing_and_disk(build, ca
     monkeypatch.setattr(adapting, "adaptation_loss", failing)
     result = run(build(), [noise_scene(9)], recipe)
     assert same(tensors(result), tensors(whole))
-    assert len(used) == 2 + 3
+    # Two before the memory ran out, three steps, and two looks at what came out.
+    assert len(used) == 2 + 3 + 2
     assert "once more with activation checkpointing" in caplog.text
 
     def always(*args, **options):
@@ -335,7 +336,7 @@ def test_a_loss_that_is_not_finite_stops_before_the_optimiser(build, value, monk
     def remember(progress):
         seen.append([parameter.detach().clone() for parameter in adapters[0].parameters()])
 
-    with pytest.raises(FreeGeoError, match="Loss term intra is not finite at step 2") as error:
+    with pytest.raises(FreeGeoError, match="loss term intra is not finite at step 2. Lower --lr") as error:
         run(model, [noise_scene(9)], quick(model), on_step=remember)
     assert not isinstance(error.value, UserError)
     assert len(seen) == 2

@@ -50,6 +50,7 @@ def test_the_term_is_announced_and_part_of_the_total():
     assert last["total"] == pytest.approx(last["intra"] + last["cross"] + last["hold"], rel=1e-5)
 
 
-def test_a_negative_weight_is_refused():
-    with pytest.raises(UserError, match="--hold must be 0 or more, got -1"):
-        quick(tiny_da3(), hold=-1)
+@pytest.mark.parametrize("weight", [-1, float("nan"), float("inf")])
+def test_a_weight_that_is_no_number_from_zero_is_refused(weight):
+    with pytest.raises(UserError, match=f"--hold must be 0 or more and finite, got {weight}"):
+        quick(tiny_da3(), hold=weight)

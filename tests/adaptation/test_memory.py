@@ -207,12 +207,19 @@ def test_the_disk_is_looked_at_where_the_files_will_be(tmp_path, monkeypatch):
     assert asked == [tmp_path]
 
 
-def test_the_plan_is_logged_with_its_parts(caplog, monkeypatch):
+def test_the_plan_is_said_in_one_line_and_its_parts_to_those_who_ask(caplog, monkeypatch):
     monkeypatch.setattr(memory.shutil, "disk_usage", lambda path: SimpleNamespace(free=100 * GB))
-    caplog.set_level("INFO")
-    eth3d(14.7)
-    for part in ("weights", "optimiser", "14.7 GB", "checkpointing", "on disk"):
-        assert part in caplog.text
+    caplog.set_level("DEBUG")
+    plan = eth3d(14.7)
+    said, parts = caplog.messages
+    assert said == (
+        f"adaptation needs about {plan.peak_bytes / 1e9:.1f} GB of memory (to fit: {plan.kept_bytes / 1e9:.1f} GB of "
+        "teacher features on disk and activations computed twice, which is slower); 14.7 GB are free"
+    )
+    assert "weights" in parts and "optimiser" in parts
+    caplog.clear()
+    eth3d(200.0)
+    assert caplog.messages[0].endswith("GB of memory; 200.0 GB are free")
 
 
 def test_every_run_plans_with_what_is_free(monkeypatch):

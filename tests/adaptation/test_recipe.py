@@ -73,7 +73,8 @@ def test_the_papers_settings_are_those_of_a_published_model():
 def test_every_recipe_keeps_every_second_view(views):
     """Eight views keep (0, 2, 4, 6), as in the paper; scenes of fewer views and `--views` keep to the same rule."""
     for name in get_args(recipes.RecipeName):
-        recipe = recipes.named(name, GIANT, "eth3d").changed(views=max(views, 8), repeat_views=False)
+        dataset = None if name == "scene" else "eth3d"
+        recipe = recipes.named(name, GIANT, dataset).changed(views=max(views, 8), repeat_views=False)
         first = view_sets([views], recipe)[0]
         assert (first.frames, first.kept) == (tuple(range(views)), tuple(range(0, views, 2)))
 
@@ -154,14 +155,37 @@ def test_changed_reaches_the_loss_and_leaves_its_other_settings():
         ({"keep": (0, 8)}, "within 0..7"),
         ({"keep": (2, 0)}, "ascend"),
         ({"keep": (0, 0, 2)}, "ascend"),
-        ({"keep": tuple(range(8))}, "fewer than 8"),
-        ({"lr": 0.0}, "lr must be positive"),
-        ({"rank": -1}, "rank must be positive"),
+        ({"keep": tuple(range(8))}, "fewer than all 8"),
+        ({"keep": ()}, "at least 2"),
+        ({"keep": (-1, 2)}, "within 0..7"),
+        ({"keep": (0, 2.0)}, "ascending positions"),
+        ({"keep": (1, 3)}, "must begin with 0: view 0 is the reference"),
+        ({"keep": (0, 2, 9), "views": 9}, "within 0..8"),
+        ({"views": 8.0}, "--views must be a whole number"),
+        ({"lr": 0.0}, "--lr must be positive"),
+        ({"lr": -1e-3}, "--lr must be positive"),
+        ({"lr": float("nan")}, "--lr must be positive and finite, got nan"),
+        ({"lr": float("inf")}, "--lr must be positive and finite"),
+        ({"final_lr": 1.0}, "final_lr must be from 0 to the peak rate"),
+        ({"final_lr": float("nan")}, "final_lr must be from 0"),
+        ({"rank": -1}, "--rank must be positive"),
+        ({"rank": 4.5}, "--rank must be a whole number"),
+        ({"rank": True}, "--rank must be a whole number"),
+        ({"sets_per_scene": 0}, "--sets must be positive"),
         ({"batch": 0}, "batch must be positive"),
+        ({"dropout": 1.0}, "dropout must be from 0 to below 1"),
+        ({"warmup": float("nan")}, "warmup must be from 0"),
+        ({"weight_decay": float("inf")}, "weight_decay must be from 0"),
+        ({"clip": 0.0}, "clip must be positive"),
+        ({"steps": 2.5}, "--steps must be a whole number"),
+        ({"epochs": -1}, "at least 1"),
         ({"steps": 0}, "at least 1"),
         ({"steps": 5, "epochs": 2}, "either --steps or --epochs"),
         ({"loss": {"weight_kk": 0.0}}, "no loss setting 'weight_kk'; known are intra_tokens"),
         ({"loss": {"selection": "best"}}, "selection is one of mixed, topk, random"),
+        ({"loss": {"weight_kq": float("inf")}}, "0 or more and finite"),
+        ({"loss": {"temperature": float("inf")}}, "temperature must be positive and finite"),
+        ({"loss": {"num_query": 2.5}}, "num_query must be a whole number"),
     ],
 )
 def test_impossible_settings_are_refused(changes, words):
@@ -177,3 +201,38 @@ def test_unknown_recipes_and_missing_datasets_are_refused():
             recipes.named(name, GIANT)
         with pytest.raises(UserError, match="settings per dataset"):
             recipes.named(name, GIANT, "kitti")
+
+
+@pytest.mark.parametrize("seed", [-1, 2**64, 1.5])
+def test_seeds_beyond_64_bits_are_refused(seed):
+    with pytest.raises(UserError, match="--seed must be"):
+        recipes.require_seed(seed)
+
+
+def test_a_dataset_that_would_change_nothing_is_refused():
+    with pytest.raises(UserError, match="'scene' has no settings per dataset, so --dataset eth3d would change nothing"):
+        recipes.named("scene", GIANT, "eth3d")
+
+
+def test_a_recipe_of_the_other_family_is_said(caplog):
+    recipes.named("released-da3", GIANT, "eth3d")
+    recipes.named("released-vggt", SPEC, "eth3d")
+    assert not caplog.messages
+    recipes.named("released-vggt", GIANT, "eth3d")
+    assert "another model family than that of da3-giant; its own are 'released-da3'" in caplog.text
+
+
+@pytest.mark.parametrize("lr", [1e-9, 1e-4, 1.0])
+def test_the_rate_never_rises_after_the_warm_up(lr):
+    """A rate below the recipe's final rate takes that down with it."""
+    found = recipes.named("paper", GIANT, "eth3d").changed(lr=lr)
+    rates = [learning_rate(step, 40, found) for step in range(6, 40)]
+    assert rates == sorted(rates, reverse=True)
+    assert rates[0] == lr
+    assert found.changed(lr=1e-4, final_lr=1e-6).final_lr == 1e-6
+
+
+def test_recipes_carry_the_precision_of_what_they_reproduce():
+    names = ("scene", "paper", "released-da3", "released-vggt")
+    found = [recipes.named(name, GIANT, None if name == "scene" else "eth3d").precision for name in names]
+    assert found == [None, "fp16", "fp16", "fp16"]

@@ -9,7 +9,7 @@ import torch
 
 from freegeo.adaptation import samples as sampling
 from freegeo.adaptation.adapt import adapt
-from freegeo.adaptation.adapter import Adapter
+from freegeo.adaptation.adapter import Adapter, is_adapted
 from freegeo.adaptation.recipe import released
 from freegeo.adaptation.samples import Samples, SceneImages, loaded_ahead
 from freegeo.adaptation.views import schedule
@@ -62,11 +62,14 @@ def test_a_sample_is_the_frozen_model_s_view_of_its_set(build, hold, place, tmp_
 def test_the_teacher_runs_once_per_distinct_view_set():
     def passes(build, count, recipe):
         model, seen = build(), []
-        # The frozen pass over all views is the one without gradients.
         aggregate = model.aggregate
-        model.aggregate = lambda *args, **options: (
-            (None if torch.is_grad_enabled() else seen.append(args)) or aggregate(*args, **options)
-        )
+
+        def watched(tokens, **options):
+            if tokens.tokens.shape[1] == min(count, recipe.views) and not is_adapted(model):
+                seen.append(tokens)
+            return aggregate(tokens, **options)
+
+        model.aggregate = watched
         adapt(model, [noise_scene(count)], recipe, seed=42)
         return len(seen)
 

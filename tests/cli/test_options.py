@@ -89,7 +89,7 @@ def test_the_help_needs_no_dictionary(freegeo, command):
 
 @pytest.mark.parametrize("given", ["freegeo-tiny", "FREEGEO-TINY"])
 def test_the_model_has_one_name_in_results(given):
-    assert ModelOptions(model=given).identity()["model"] == "freegeo-tiny"
+    assert ModelOptions(model=given).identity(None)["model"] == "freegeo-tiny"
 
 
 def test_a_model_may_be_given_by_its_hub_id():

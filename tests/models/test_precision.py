@@ -35,6 +35,24 @@ def test_the_best_at_hand_is_taken(monkeypatch, bf16, precision):
     assert Compute.choose("cuda:0", "fp16") == Compute(device=torch.device("cuda:0"), precision="fp16")
 
 
+def test_published_work_takes_its_precision_on_a_gpu_unless_another_is_asked_for(monkeypatch):
+    with_cuda(monkeypatch, bf16=True)
+    assert Compute.choose().preferring("fp16").precision == "fp16"
+    assert Compute.choose().preferring("fp32").preferring(None).precision == "fp32"
+    assert Compute.choose().preferring("fp32").preferring("fp16").precision == "fp16"
+    assert Compute.choose(precision="bf16").preferring("fp16").precision == "bf16"
+    assert Compute(device=torch.device("cuda"), precision="bf16").preferring("fp16").precision == "bf16"
+    assert Compute.choose("cpu").preferring("fp16") == Compute()
+    with pytest.raises(UserError, match="unknown precision 'half'"):
+        Compute.choose().preferring("half")
+
+
+def test_a_gpu_without_bf16_takes_fp16_for_it_as_the_released_evaluation_does(monkeypatch):
+    with_cuda(monkeypatch, bf16=False)
+    assert Compute.choose().preferring("bf16").precision == "fp16"
+    assert Compute.choose().precision == "fp32"
+
+
 def test_what_is_not_there_is_refused(monkeypatch):
     without_accelerators(monkeypatch)
     with pytest.raises(UserError, match="'cuda' is not available here"):

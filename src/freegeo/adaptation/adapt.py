@@ -1,7 +1,7 @@
 """Adaptation: the paper's Algorithm 1 as a loop that can be stopped and continued at any step.
 
-Reading order: `adapt` (what a run is), `_train` (the loop), `_learn` (one view set), `_State` (what changes
-from step to step; `state` writes it to disk).
+Reading order: `adapt` (what a run is), `_train` and `_steps` (the loop), `_learn` (one view set), `_State` (what
+changes from step to step; `state` writes it to disk), `trouble` (whether what came out may be used).
 """
 
 from __future__ import annotations
@@ -22,19 +22,21 @@ from torch import Tensor
 
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.adapter_files import save_adapter
-from freegeo.adaptation.losses import adaptation_loss, feature_distance, require_finite
+from freegeo.adaptation.losses import adaptation_loss, feature_distance, not_finite
 from freegeo.adaptation.memory import Plan, plan_adaptation
-from freegeo.adaptation.recipe import Recipe
-from freegeo.adaptation.samples import STEP_SEED_STRIDE, Sample, Samples, SceneImages, loss_features, step_draws
-from freegeo.adaptation.state import read_state, remove_state, write_state
-from freegeo.adaptation.views import Visit, schedule
-from freegeo.errors import FreeGeoError
+from freegeo.adaptation.recipe import Recipe, require_seed
+from freegeo.adaptation.samples import Sample, Samples, SceneImages, loss_features, step_draws, step_seed
+from freegeo.adaptation.state import read_state, remove_state, undisturbed, write_state
+from freegeo.adaptation.views import Visit, schedule, substitution
+from freegeo.errors import DivergedError, FreeGeoError
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
 
 logger = logging.getLogger(__name__)
 
 SAVE_EVERY_S = 30.0
+BLOWN_UP = 1e4
+"""A loss of so many times the first step's ends a run: no run was seen to come back from there, and steps get slow."""
 CPU = Compute()
 
 
@@ -51,7 +53,10 @@ class Progress:
 
 @dataclass
 class Adapted:
-    """A trained adapter, attached to its model, with the settings and the loss curve of its run."""
+    """A trained adapter, attached to its model, with the settings and the loss curve of its run.
+
+    `trouble` says whether it may be used.
+    """
 
     adapter: Adapter
     recipe: Recipe
@@ -59,15 +64,25 @@ class Adapted:
     scenes: tuple[str, ...]
     curve: list[dict[str, float]] = field(default_factory=list)
     """Loss terms of every step."""
+    gain: dict[str, float] = field(default_factory=dict)
+    """Total loss of the last step's view sets: `frozen` without the adapter, `adapted` with it, equal tokens drawn."""
     seconds: float = 0.0
+    """Duration, with that of the earlier parts of a run that was continued."""
+    precision: str = "fp32"
 
     def __repr__(self) -> str:
-        """Return the recipe, the number of steps, the loss at start and end, and the duration."""
+        """Return the recipe, the number of steps, the loss at start and end, the duration, and whether to beware."""
         change = self.loss_change()
         return (
             f"Adapted({self.recipe.name} recipe, {len(self.curve)} steps, loss {change['first']:.4g} -> "
-            f"{change['last']:.4g}, {self.seconds:.0f} s)"
+            f"{change['last']:.4g}, {self.seconds:.0f} s{', not to be used: see trouble' if self.trouble else ''})"
         )
+
+    @property
+    def trouble(self) -> str | None:
+        """Why the adapter should not be used, in one sentence, and what to do; None where it may be (see `trouble`)."""
+        broken = [name for name, value in self.adapter.named_parameters().items() if not bool(value.isfinite().all())]
+        return trouble(self.gain, broken, self.recipe)
 
     def metadata(self) -> dict[str, Any]:
         """Return the entries of freegeo.json that describe the run."""
@@ -75,7 +90,11 @@ class Adapted:
             "recipe": asdict(self.recipe),
             "seed": self.seed,
             "scenes": list(self.scenes),
+            "precision": self.precision,
             "loss_curve": self.curve,
+            # JSON has no infinity.
+            "gain": {name: value if math.isfinite(value) else None for name, value in self.gain.items()},
+            "trouble": self.trouble,
             "seconds": round(self.seconds, 2),
         }
 
@@ -95,6 +114,39 @@ def loss_change(curve: Sequence[Mapping[str, float]]) -> dict[str, float]:
     totals = [terms["total"] for terms in curve]
     tenth = max(1, len(totals) // 10)
     return {"first": sum(totals[:tenth]) / tenth, "last": sum(totals[-tenth:]) / tenth}
+
+
+def trouble(gain: Mapping[str, float], broken: Sequence[str], recipe: Recipe) -> str | None:
+    """Say in one sentence why a finished adapter should not be used, and what to do; None where it may be.
+
+    The rule compares like with like: the same view sets and tokens, without the adapter and with it, after the last
+    update. The loss curve cannot decide. Its start and end are of different view sets, whose losses differ by more than
+    a short run gains, so that good runs seem to rise; a run that blows up at once has its worst losses at the start, so
+    that it seems to fall; and it lacks the last update, which in a run of one step is all there is.
+
+    Args:
+        gain: `Adapted.gain`.
+        broken: the adapter's tensors with values that are not finite.
+        recipe: of the run.
+    """
+    lower = f"Lower --lr (now {recipe.lr:g}), take fewer --steps or another --recipe."
+    if broken:
+        return f"the adapter has values that are not finite ({len(broken)} tensors, first {broken[0]}). {lower}"
+    if not all(map(math.isfinite, gain.values())):
+        return f"with the adapter the loss is not finite. {lower}"
+    losses = (
+        f"the loss of the last view sets is {gain['adapted']:.4g} with the adapter and {gain['frozen']:.4g} without"
+    )
+    if gain["adapted"] > gain["frozen"]:
+        return f"adaptation made the model worse at its own task: {losses}. {lower}"
+    if gain["adapted"] == gain["frozen"]:
+        return f"adaptation changed nothing: {losses}. Raise --lr (now {recipe.lr:g}) or take more --steps."
+    return None
+
+
+def visited(steps: Sequence[Sequence[Visit]]) -> Sequence[Sequence[Visit]]:
+    """Return the visits of a run's steps and then those of its last step again, for the look at what came out."""
+    return [*steps, steps[-1]]
 
 
 def learning_rate(step: int, steps: int, recipe: Recipe) -> float:
@@ -125,19 +177,24 @@ def adapt(
         scenes: at least 3 images each.
         recipe: everything that decides the result, with `seed`.
         seed: of the adapter's start, the order of view sets, token draws and dropout.
-        compute: device and precision.
+        compute: device and precision; a default precision gives way to the recipe's.
         plan: where samples are kept and whether activations are recomputed; None: the fastest plan that fits.
-        resume_in: folder for the state of an unfinished run. The same call continues the run; on the CPU it ends with
-            the same tensors as a run without a stop.
+        resume_in: folder for the state of an unfinished run, written every 30 s and on Ctrl-C. The same call continues
+            the run; on the CPU it ends with the same tensors as a run without a stop.
         on_step: called after every step.
         on_epoch: called after every epoch with its number and the adapter.
 
     Raises:
         UserError: scenes that are too small, a state of another run, or a run that does not fit into memory.
-        FreeGeoError: a loss or gradient that is not finite, or memory that runs out even with the smallest plan.
+        DivergedError: a loss or gradient that is not finite, or a loss that has grown beyond recovery.
+        FreeGeoError: memory that runs out even with the smallest plan.
     """
+    require_seed(seed)
+    compute = compute.preferring(recipe.precision)
+    if said := substitution([scene.count for scene in scenes], recipe):
+        logger.info(said)
     steps = schedule([scene.count for scene in scenes], recipe, seed)
-    plan = plan or plan_adaptation(model, scenes, recipe, steps, compute=compute, folder=resume_in)
+    plan = plan or plan_adaptation(model, scenes, recipe, visited(steps), compute=compute, folder=resume_in)
     run = _Run(model.adaptable(), scenes, recipe, steps, seed, compute, resume_in, on_step, on_epoch)
     try:
         return _train(run, plan)
@@ -174,69 +231,108 @@ class _Run:
 
 
 def _train(run: _Run, plan: Plan) -> Adapted:
-    """Algorithm 1: per step, compare the student with the frozen teacher on every view set and update the adapter."""
+    """Attach an adapter, train it or go on training it, and look at what came out."""
     started, recipe, steps = time.monotonic(), run.recipe, run.steps
     model = run.model.to(run.compute.device)
     adapter = Adapter.attach(
         model, rank=recipe.rank, alpha=recipe.alpha, dropout=recipe.dropout,
         generator=torch.Generator().manual_seed(run.seed),
     )  # fmt: skip
-    result = Adapted(adapter=adapter, recipe=recipe, seed=run.seed, scenes=tuple(scene.name for scene in run.scenes))
+    result = Adapted(
+        adapter=adapter, recipe=recipe, seed=run.seed, scenes=tuple(scene.name for scene in run.scenes),
+        precision=run.compute.precision,
+    )  # fmt: skip
     with ExitStack() as undo:
         undo.callback(adapter.detach)
-        state = _State(run, result)
+        state = _State(run, result, started)
         samples = Samples(
-            adapter, run.scenes, recipe, steps[state.next_step :], compute=run.compute, place=plan.place,
+            adapter, run.scenes, recipe, visited(steps)[state.next_step :], compute=run.compute, place=plan.place,
             folder=run.folder, seed=run.seed,
         )  # fmt: skip
         undo.callback(samples.close)
-        saved_at = time.monotonic()
-        for step in range(state.next_step, len(steps)):
-            state.optimiser.zero_grad(set_to_none=True)
-            with _training(run, plan, step):
-                parts = [_learn(run, adapter, visit, samples.take(visit), state.scaler) for visit in steps[step]]
-            terms = {name: torch.stack([part[name] for part in parts]).sum() for name in parts[0]}
-            state.update(step, terms)
-            epoch = steps[step][0].epoch
-            run.on_step(Progress(step=step, steps=len(steps), epoch=epoch, terms=terms))
-            if step + 1 == len(steps) or steps[step + 1][0].epoch != epoch:
-                state.read_terms()
-                run.on_epoch(epoch, adapter)
-            if run.folder is not None and time.monotonic() - saved_at > SAVE_EVERY_S:
-                state.save(step + 1, seconds=result.seconds + time.monotonic() - started)
-                saved_at = time.monotonic()
+        try:
+            _steps(run, plan, samples, state)
+            result.gain = _gain(run, adapter, samples)
+        except (KeyboardInterrupt, SystemExit):
+            state.save_stopped()
+            raise
         undo.pop_all()
         samples.close()
-    result.seconds += time.monotonic() - started
+    result.seconds = state.seconds()
     return result
+
+
+def _steps(run: _Run, plan: Plan, samples: Samples, state: _State) -> None:
+    """Algorithm 1: per step, compare the student with the frozen teacher on every view set and update the adapter."""
+    steps, adapter = run.steps, state.result.adapter
+    saved_at = time.monotonic()
+    for step in range(state.next_step, len(steps)):
+        state.optimiser.zero_grad(set_to_none=True)
+        with _training(run, plan, step):
+            parts = [_learn(run, adapter, visit, samples.take(visit), state.scaler) for visit in steps[step]]
+        terms = {name: torch.stack([part[name] for part in parts]).sum() for name in parts[0]}
+        with undisturbed():
+            state.update(terms)
+        epoch = steps[step][0].epoch
+        run.on_step(Progress(step=step, steps=len(steps), epoch=epoch, terms=terms))
+        if step + 1 == len(steps) or steps[step + 1][0].epoch != epoch:
+            state.read_terms()
+            run.on_epoch(epoch, adapter)
+        if run.folder is not None and time.monotonic() - saved_at > SAVE_EVERY_S:
+            state.save()
+            saved_at = time.monotonic()
 
 
 def _learn(
     run: _Run, adapter: Adapter, visit: Visit, sample: Sample, scaler: torch.amp.GradScaler
 ) -> dict[str, Tensor]:
     """Add the gradients of one view set, and return its share of the step's loss terms."""
-    recipe, share = run.recipe, 1 / len(run.steps[visit.step])
-    draws = step_draws(sample, visit, recipe.loss, seed=run.seed)
-    tokens, teacher = sample.student()
-    with run.compute.autocast():
-        student = loss_features(adapter.model, tokens)
-    loss, terms = adaptation_loss(
-        student.levels, teacher, sample.held_out, draws, recipe.loss, form=sample.form,
-        patches=sample.student_patches(),
-    )  # fmt: skip
+    share = 1 / len(run.steps[visit.step])
+    loss, terms = _student_loss(run, adapter, visit, sample)
     scaler.scale(loss * share).backward()
-    if recipe.hold:
-        # Not in the paper: penalises the distance of the adapted features from the frozen ones, over all views.
-        del tokens, teacher, student, loss
-        with run.compute.autocast():
-            adapted = loss_features(adapter.model, sample.tokens)
-        held = (
-            recipe.hold
-            * feature_distance(adapted.levels, sample.teacher.levels, recipe.loss, patches=sample.patches)[0]
-        )
+    if run.recipe.hold:
+        held = _hold_loss(run, adapter, sample)
         scaler.scale(held * share).backward()
         terms = {**terms, "hold": held.detach(), "total": terms["total"] + held.detach()}
     return {name: term * share for name, term in terms.items()}
+
+
+def _student_loss(run: _Run, adapter: Adapter, visit: Visit, sample: Sample) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the adaptation loss of one view set, and its detached terms."""
+    draws = step_draws(sample, visit, run.recipe.loss, seed=run.seed)
+    tokens, teacher = sample.student()
+    with run.compute.autocast():
+        student = loss_features(adapter.model, tokens)
+    return adaptation_loss(
+        student.levels, teacher, sample.held_out, draws, run.recipe.loss, form=sample.form,
+        patches=sample.student_patches(),
+    )  # fmt: skip
+
+
+def _hold_loss(run: _Run, adapter: Adapter, sample: Sample) -> Tensor:
+    """Return the distance of the adapted features from the frozen ones, over all views (not in the paper)."""
+    with run.compute.autocast():
+        adapted = loss_features(adapter.model, sample.tokens)
+    levels, teacher = adapted.levels, sample.teacher.levels
+    return run.recipe.hold * feature_distance(levels, teacher, run.recipe.loss, patches=sample.patches)[0]
+
+
+@torch.no_grad()
+def _gain(run: _Run, adapter: Adapter, samples: Samples) -> dict[str, float]:
+    """Return the total loss of the last step's view sets without and with the adapter as it is now, equal tokens drawn.
+
+    The loss of a step is that before its update, and of other view sets than the first step's.
+    """
+    frozen = adapted = 0.0
+    for visit in run.steps[-1]:
+        sample = samples.take(visit)
+        with adapter.off():
+            frozen += float(_student_loss(run, adapter, visit, sample)[0])
+        adapted += float(_student_loss(run, adapter, visit, sample)[0])
+        if run.recipe.hold:  # 0 for the frozen model
+            adapted += float(_hold_loss(run, adapter, sample))
+    count = len(run.steps[-1])
+    return {"frozen": frozen / count, "adapted": adapted / count}
 
 
 @contextmanager
@@ -247,7 +343,7 @@ def _training(run: _Run, plan: Plan, step: int) -> Generator[None]:
     model.set_recompute(plan.checkpointing)
     try:
         with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-            torch.manual_seed(run.seed * STEP_SEED_STRIDE + step)
+            torch.manual_seed(step_seed(run.seed, step))
             yield
     finally:
         model.eval()
@@ -257,21 +353,21 @@ def _training(run: _Run, plan: Plan, step: int) -> Generator[None]:
 class _State:
     """What changes from step to step and can be saved and restored: adapter, optimiser, gradient scaler, loss curve."""
 
-    def __init__(self, run: _Run, result: Adapted):
-        self.run, self.result = run, result
+    def __init__(self, run: _Run, result: Adapted, started: float):
+        self.run, self.result, self.started = run, result, started
         self.parameters = result.adapter.parameters()
         self.optimiser = torch.optim.AdamW(self.parameters, lr=0.0, weight_decay=run.recipe.weight_decay, fused=True)
         self.scaler = torch.amp.GradScaler(run.compute.device.type, enabled=run.compute.precision == "fp16")
         self.unread: list[tuple[int, dict[str, Tensor]]] = []
         self.next_step = self._restore()
 
-    def update(self, step: int, terms: dict[str, Tensor]) -> None:
+    def update(self, terms: dict[str, Tensor]) -> None:
         """Clip the gradients and take an optimiser step.
 
-        On the CPU a loss or gradient that is not finite raises FreeGeoError before the step. On an accelerator the
-        check would wait for the device, so it is left to a later call of `read_terms`.
+        On the CPU a run that has diverged ends before the step. On an accelerator the check would wait for the device,
+        so it is left to a later call of `read_terms`.
         """
-        recipe = self.run.recipe
+        step, recipe = self.next_step, self.run.recipe
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(step, len(self.run.steps), recipe)
         self.scaler.unscale_(self.optimiser)
@@ -282,23 +378,48 @@ class _State:
             self.read_terms()
         self.scaler.step(self.optimiser)
         self.scaler.update()
+        self.next_step += 1
 
     def read_terms(self) -> None:
-        """Move the loss terms that are still on the device to the curve; FreeGeoError when one is not finite."""
+        """Move the loss terms that are still on the device to the curve; DivergedError when they show a lost run."""
+        curve = self.result.curve
         for step, terms in self.unread:
-            require_finite(terms, step=step)
-            self.result.curve.append({name: float(value) for name, value in terms.items() if name != "gradient"})
+            name = not_finite(terms)
+            if name is not None:
+                raise self._diverged(f"loss term {name} is not finite at step {step}")
+            curve.append({name: float(value) for name, value in terms.items() if name != "gradient"})
+            first, last = curve[0]["total"], curve[-1]["total"]
+            if last > BLOWN_UP * first:
+                raise self._diverged(f"the loss has grown from {first:.3g} to {last:.3g} by step {step}")
         self.unread.clear()
 
-    def save(self, next_step: int, *, seconds: float) -> None:
-        """Write the state of a run that continues at `next_step`."""
+    def _diverged(self, what: str) -> DivergedError:
+        half = " or use --precision fp32" if self.run.compute.precision != "fp32" else ""
+        return DivergedError(f"adaptation diverged: {what}. Lower --lr (now {self.run.recipe.lr:g}){half}.")
+
+    def seconds(self) -> float:
+        """Return how long the run has taken so far, with its earlier parts."""
+        return self.result.seconds + time.monotonic() - self.started
+
+    def save(self) -> None:
+        """Write the state after the last finished step."""
         assert self.run.folder is not None
         self.read_terms()
         about = {
-            "identity": self._identity(), "next_step": next_step, "curve": self.result.curve, "seconds": seconds,
-            "scaler": self.scaler.state_dict(),
+            "identity": self._identity(), "next_step": self.next_step, "curve": self.result.curve,
+            "seconds": self.seconds(), "scaler": self.scaler.state_dict(),
         }  # fmt: skip
         write_state(self.run.folder, self.result.adapter, self.optimiser, about)
+
+    def save_stopped(self) -> None:
+        """Write the state of a run that is being stopped, if it has a folder and a step to its name, and say so."""
+        if self.run.folder is None or self.next_step == 0:
+            return
+        self.save()
+        logger.info(
+            "stopped after step %d of %d; its state is saved, the same command continues",
+            self.next_step, len(self.run.steps),
+        )  # fmt: skip
 
     def _restore(self) -> int:
         """Load the saved state, if there is one, and return the step to continue at."""
@@ -312,8 +433,9 @@ class _State:
         return about["next_step"]
 
     def _identity(self) -> str:
-        """Return a fingerprint of model name, scenes, recipe and seed; pixels and weights are left out."""
+        """Return a fingerprint of model name, scenes, recipe, seed and precision; pixels and weights are left out."""
         scenes = [(scene.name, scene.count) for scene in self.run.scenes]
         model, recipe = self.run.model.spec.name, asdict(self.run.recipe)
         about = {"model": model, "scenes": scenes, "recipe": recipe, "seed": self.run.seed}
+        about["precision"] = self.run.compute.precision
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]

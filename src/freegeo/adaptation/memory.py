@@ -62,10 +62,14 @@ class Plan:
         return sum(size for _, size in self.parts)
 
     def summary(self) -> str:
-        """Return one line for the user."""
-        how = ", activation checkpointing" if self.checkpointing else ""
-        where = f", teacher features of {self.kept_bytes / 1e9:.2f} GB on disk" if self.place == "disk" else ""
-        return f"adaptation needs about {_listed(self.parts)}{how}{where}"
+        """Return one line for the user: how much memory it takes, and what is done where that would be too much."""
+        how = []
+        if self.place == "disk":
+            how.append(f"{_gigabytes(self.kept_bytes)} of teacher features on disk")
+        if self.checkpointing:
+            how.append("activations computed twice")
+        slower = f" (to fit: {' and '.join(how)}, which is slower)" if how else ""
+        return f"adaptation needs about {_gigabytes(self.peak_bytes)} of memory{slower}"
 
 
 def plan_adaptation(
@@ -90,7 +94,8 @@ def plan_adaptation(
     for checkpointing, where in product((False, True), ("device", "disk")):
         plan = job.plan(where, checkpointing)
         if plan.peak_bytes <= budget and (plan.place != "disk" or plan.kept_bytes < free_disk):
-            logger.info("%s (%.1f GB are free)", plan.summary(), budget / 1e9)
+            logger.info("%s; %s are free", plan.summary(), _gigabytes(budget))
+            logger.debug("at the peak: %s", ", ".join(f"{name} {_gigabytes(size)}" for name, size in plan.parts))
             return plan
     raise UserError(
         f"adapting {model.spec.name} needs {plan.peak_bytes / 1e9:.1f} GB even with activation checkpointing (and "
@@ -375,10 +380,8 @@ def host_available() -> int:
     return 8 << 30
 
 
-def _listed(parts: Parts) -> str:
-    """Return "12.3 GB (weights 2.30, ...)"."""
-    listed = ", ".join(f"{name} {size / 1e9:.2f}" for name, size in parts if size)
-    return f"{sum(size for _, size in parts) / 1e9:.2f} GB ({listed})"
+def _gigabytes(size: int) -> str:
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e9:.2f} GB"
 
 
 def _size(part: tuple[str, int]) -> int:

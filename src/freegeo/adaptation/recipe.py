@@ -9,6 +9,8 @@ This module loads no torch, so that the command line can read names and defaults
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
@@ -16,7 +18,10 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, get_origin
 from freegeo.errors import UserError
 
 if TYPE_CHECKING:
+    from freegeo.models.precision import Precision
     from freegeo.models.spec import ModelSpec
+
+logger = logging.getLogger(__name__)
 
 RecipeName = Literal["scene", "paper", "released-da3", "released-vggt"]
 DatasetName = Literal["eth3d", "7scenes", "scannetpp", "hiroom", "procedural"]
@@ -85,11 +90,13 @@ class LossConfig:
             *("huber_delta", "angle_huber_delta", "distance_beta", "outer_beta", "temperature"),
             *("num_reference", "num_query", "num_anchors"),
         ):
-            if not getattr(self, name) > 0:
-                raise UserError(f"Loss setting {name} must be positive, not {getattr(self, name)}.")
+            if not 0 < getattr(self, name) < math.inf:
+                raise UserError(f"Loss setting {name} must be positive and finite, not {getattr(self, name)}.")
+        for name in ("num_reference", "num_query", "num_anchors", "reference_view"):
+            _require_whole(f"Loss setting {name}", getattr(self, name))
         weights = [getattr(self, field.name) for field in fields(self) if field.name.startswith("weight_")]
-        if not all(weight >= 0 for weight in (*weights, *self.angle_weights)):
-            raise UserError("Loss weights must be 0 or more.")
+        if not all(0 <= weight < math.inf for weight in (*weights, *self.angle_weights)):
+            raise UserError("Loss weights must be 0 or more and finite.")
         for name, choices in _LOSS_CHOICES.items():
             if getattr(self, name) not in choices:
                 raise UserError(f"Loss setting {name} is one of {', '.join(choices)}, not {getattr(self, name)}.")
@@ -164,29 +171,53 @@ class Recipe:
     rank: int
     alpha: int
     dropout: float
+    precision: Precision | None
+    """Arithmetic of the adaptation on a CUDA device unless the user asks for another; None: the device's default."""
 
     def __post_init__(self):
+        for name in ("views", "sets_per_scene", "first_seed", "distinct_seeds", "batch", "rank", "alpha"):
+            _require_whole(_OPTIONS.get(name, f"recipe setting {name}"), getattr(self, name))
+        for name in ("steps", "epochs"):
+            if getattr(self, name) is not None:
+                _require_whole(_OPTIONS[name], getattr(self, name))
         if self.views < SMALLEST_SCENE:
             raise UserError(f"--views must be at least {SMALLEST_SCENE}, got {self.views}.")
         if self.keep is not None:
-            kept = sorted(set(self.keep))
-            if len(kept) != len(self.keep) or tuple(kept) != self.keep or kept[0] < 0 or kept[-1] >= self.views:
-                raise UserError(f"--keep {self.keep} must ascend within 0..{self.views - 1}.")
-            if not 2 <= len(kept) < self.views:
-                raise UserError(f"--keep must name at least 2 and fewer than {self.views} of the views.")
-        if self.hold < 0:
-            raise UserError(f"--hold must be 0 or more, got {self.hold}.")
-        options = {"lr": "--lr", "rank": "--rank", "sets_per_scene": "--sets", "alpha": "alpha", "batch": "batch"}
-        for name, shown in options.items():
-            if not getattr(self, name) > 0:
-                raise UserError(f"{shown} must be positive, got {getattr(self, name)}.")
+            self._check_keep(self.keep)
+        if not 0 <= self.hold < math.inf:
+            raise UserError(f"--hold must be 0 or more and finite, got {self.hold}.")
+        for name in ("lr", "rank", "alpha", "batch", "sets_per_scene", "distinct_seeds", "clip"):
+            if not 0 < getattr(self, name) < math.inf:
+                option = _OPTIONS.get(name, f"recipe setting {name}")
+                raise UserError(f"{option} must be positive and finite, got {getattr(self, name)}.")
+        if not 0 <= self.final_lr <= self.lr:
+            raise UserError(
+                f"recipe setting final_lr must be from 0 to the peak rate {self.lr:g}, got {self.final_lr}."
+            )
+        for name, end in {"weight_decay": math.inf, "warmup": 1, "dropout": 1}.items():
+            if not 0 <= getattr(self, name) < end:
+                raise UserError(f"recipe setting {name} must be from 0 to below {end}, got {getattr(self, name)}.")
         if (self.steps is None) == (self.epochs is None) or (self.steps or self.epochs or 0) < 1:
             raise UserError("a recipe needs either --steps or --epochs, not both, and at least 1.")
+
+    def _check_keep(self, keep: tuple[int, ...]) -> None:
+        listed = ",".join(map(str, keep))
+        if not all(isinstance(position, int) for position in keep) or list(keep) != sorted(set(keep)):
+            raise UserError(f"--keep {listed} must be ascending positions, such as 0,2,4,6.")
+        if not 2 <= len(keep) < self.views:
+            raise UserError(f"--keep {listed} must name at least 2 and fewer than all {self.views} views.")
+        if keep[0] < 0 or keep[-1] >= self.views:
+            raise UserError(
+                f"--keep {listed}: positions are within 0..{self.views - 1}, as the teacher sees {self.views}."
+            )
+        if keep[0] != 0:
+            raise UserError(f"--keep {listed} must begin with 0: view 0 is the reference of teacher and student.")
 
     def changed(self, *, loss: Mapping[str, Any] | None = None, **changes) -> Recipe:
         """Return the recipe with some settings replaced; those given as None stay.
 
-        Setting steps unsets epochs and the reverse; setting the rank sets alpha to it, unless that is given too. `loss`
+        Setting steps unsets epochs and the reverse; setting the rank sets alpha to it, and a rate below the final rate
+        lowers that by the same factor as the rate, unless they are given too. `loss`
         names settings of the loss, such as `{"weight_kq": 0.0}`; the others of the loss stay. UserError for a loss
         setting that does not exist, and for invalid values.
         """
@@ -197,7 +228,28 @@ class Recipe:
             given["epochs" if "steps" in given else "steps"] = None
         if "rank" in given:
             given.setdefault("alpha", given["rank"])
+        if given.get("lr", math.inf) < self.final_lr:
+            given.setdefault("final_lr", self.final_lr * given["lr"] / self.lr)
         return replace(self, **given)
+
+
+_OPTIONS = {
+    "views": "--views", "steps": "--steps", "epochs": "--epochs", "sets_per_scene": "--sets", "lr": "--lr",
+    "rank": "--rank",
+}  # fmt: skip
+"""Options of the command line by the name of the setting, for messages."""
+
+
+def _require_whole(what: str, value: object) -> None:
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise UserError(f"{what} must be a whole number (int), got {value!r}.")
+
+
+def require_seed(seed: int) -> None:
+    """Raise UserError for a seed that a generator of random numbers cannot take."""
+    _require_whole("--seed", seed)
+    if not 0 <= seed < 2**64:
+        raise UserError(f"--seed must be from 0 to 2^64 - 1, got {seed}.")
 
 
 class DatasetRow(NamedTuple):
@@ -280,11 +332,9 @@ PAPER = Recipe(
     rank=32,
     alpha=32,
     dropout=0.0,
+    precision="fp16",
 )
-"""The paper's settings, on ETH3D with DA3; `open` marks what the paper leaves open.
-
-The precision, in the paper FP16 mixed, is no part of a recipe (`--precision`).
-"""
+"""The paper's settings, on ETH3D with DA3; `open` marks what the paper leaves open."""
 
 _RELEASED = PAPER.changed(
     loss={
@@ -306,26 +356,38 @@ RELEASED_VGGT = _RELEASED.changed(
 def named(name: str, spec: ModelSpec, dataset: str | None = None) -> Recipe:
     """Return a recipe by name, for a model and, where the settings depend on it, a dataset.
 
-    UserError for an unknown recipe or dataset, or a dataset recipe without a dataset.
+    UserError for an unknown recipe or dataset, a dataset recipe without a dataset, or `scene` with one.
     """
     if name == "scene":
+        if dataset is not None:
+            raise UserError(
+                f"recipe 'scene' has no settings per dataset, so --dataset {dataset} would change nothing. Leave it "
+                "out, or choose --recipe paper, released-da3 or released-vggt."
+            )
         return scene(spec)
     if name == "paper":
         return paper(spec, dataset)
-    if name in (RELEASED_DA3.name, RELEASED_VGGT.name):
+    families = {RELEASED_DA3.name: "da3", RELEASED_VGGT.name: "vggt"}
+    if name in families:
+        if spec.adaptation.published not in (None, families[name]):
+            logger.warning(
+                "recipe '%s' holds the settings of another model family than that of %s; its own are 'released-%s'",
+                name, spec.name, spec.adaptation.published,
+            )  # fmt: skip
         return released(name, dataset, spec)
     *others, last = get_args(RecipeName)
     raise UserError(f"unknown recipe '{name}'. Known are {', '.join(others)} and {last}.")
 
 
 def scene(spec: ModelSpec) -> Recipe:
-    """Return the recipe for one source: the paper's, but 100 steps of batch 1 over 10 view sets at the model's rate."""
+    """Return the recipe for one source: the paper's losses, the model's rate, 100 steps of batch 1, 10 view sets."""
     own = spec.adaptation
-    return PAPER.changed(
+    found = PAPER.changed(
         name="scene", steps=100, batch=1, sets_per_scene=10, distinct_seeds=10, lr=own.scene_lr,
         final_lr=own.scene_lr / 1000, rank=own.rank, neighbours=own.neighbours,
         loss={"temperature": own.temperature},
     )  # fmt: skip
+    return replace(found, precision=None)
 
 
 def paper(spec: ModelSpec, dataset: str | None) -> Recipe:

@@ -319,6 +319,11 @@ def loss_features(model: ReconstructionModel, tokens: ViewTokens) -> Features:
     return model.aggregate(tokens, layers=model.spec.loss_layers, reference="first")
 
 
+def step_seed(seed: int, step: int) -> int:
+    """Return the seed of a step of a run, within the 64 bits that a generator takes."""
+    return (seed * STEP_SEED_STRIDE + step) % 2**64
+
+
 def step_draws(sample: Sample, visit: Visit, config: LossConfig, *, seed: int) -> StepDraws:
     """Draw the tokens of a visit; the random numbers depend on seed and step alone."""
     patch, special = sample.teacher.levels[max(sample.teacher.levels)]
@@ -327,7 +332,7 @@ def step_draws(sample: Sample, visit: Visit, config: LossConfig, *, seed: int) -
         tokens_per_view=patch.shape[2] + (special.shape[2] if config.cross_tokens == "all" else 0),
         student_views=len(visit.view_set.kept),
         held_out_views=len(visit.view_set.frames) - len(visit.view_set.kept),
-        generator=torch.Generator().manual_seed(seed * STEP_SEED_STRIDE + visit.step),
+        generator=torch.Generator().manual_seed(step_seed(seed, visit.step)),
         patches=sample.student_patches(),
         held_out_count=sample.held_out.shape[1],
     ).to(patch.device)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import signal
+import threading
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -61,3 +64,26 @@ def read_state(
 def remove_state(folder: Path) -> None:
     """Remove the state of a run that is finished."""
     (folder / UNFINISHED_FILE).unlink(missing_ok=True)
+
+
+@contextmanager
+def undisturbed() -> Generator[None]:
+    """Let Ctrl-C (and SIGTERM, where the program handles it) wait until the block has ended.
+
+    An optimiser step inside is taken wholly or not at all, so the state after it can be saved at any time.
+    """
+    if threading.current_thread() is not threading.main_thread():  # Signals reach the main thread only.
+        yield
+        return
+    waiting: list[Any] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: handler for number, handler in handlers.items() if callable(handler)}
+    for number in handlers:
+        signal.signal(number, lambda *arguments: waiting.append(arguments))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number, frame in waiting:
+            handlers[number](number, frame)

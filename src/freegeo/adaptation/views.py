@@ -55,6 +55,21 @@ def kept_positions(views: int, keep: tuple[int, ...] | None) -> tuple[int, ...]:
     return keep if fits else tuple(range(0, views, 2))
 
 
+def substitution(frame_counts: list[int], recipe: Recipe) -> str | None:
+    """Say what is done instead where scenes have fewer photos than a view set has views; None where all have enough."""
+    small = [count for count in frame_counts if count < recipe.views]
+    if not small:
+        return None
+    count = min(small)
+    where = f"{len(small)} of {len(frame_counts)} scenes have" if len(frame_counts) > 1 else "there are"
+    said = f"{where} fewer photos ({count}) than the {recipe.views} views of a view set (--views): "
+    if recipe.repeat_views:
+        return said + "some are repeated"
+    kept = kept_positions(count, recipe.keep)
+    keep = "" if recipe.keep in (None, kept) else f", as --keep {','.join(map(str, recipe.keep))} does not fit"
+    return said + f"the teacher sees all {count}, the student views {', '.join(map(str, kept))} of them{keep}"
+
+
 def view_sets(frame_counts: list[int], recipe: Recipe, epoch: int = 0) -> list[ViewSet]:
     """Draw all view sets of one epoch, scene by scene.
 

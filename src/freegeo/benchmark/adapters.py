@@ -49,7 +49,7 @@ class AdapterJob:
     recipe: Recipe
     seed: int
     base: Mapping[str, Any]
-    """Model, checkpoint and precision."""
+    """Model, checkpoint and the precision of the adaptation."""
 
     def configuration(self) -> dict[str, Any]:
         """Everything that decides the adapter."""
@@ -92,7 +92,9 @@ def train(
     when none is left.
     """
     if job.is_finished(out):
-        return [Problem(**problem) for problem in read_json(job.folder(out) / FINISHED)["left_out"]]
+        facts = read_json(job.folder(out) / FINISHED)
+        _warn(job, facts["trouble"])
+        return [Problem(**problem) for problem in facts["left_out"]]
     scenes, problems = _usable_scenes(job, model, data)
     folder = job.folder(out)
     write_json(folder / CONFIGURATION, job.configuration())
@@ -107,9 +109,16 @@ def train(
     )
     result.adapter.detach()
     remove_state(folder)
+    _warn(job, result.trouble)
     facts = _facts(result, model, job.recipe, peak_memory_gb(compute.device))
     write_json(folder / FINISHED, {**facts, "left_out": [asdict(problem) for problem in problems]})
     return problems
+
+
+def _warn(job: AdapterJob, trouble: str | None) -> None:
+    """Say that an adapter should not be used; its predictions are made and scored all the same."""
+    if trouble:
+        logger.warning("the adapter for %s (%s): %s", job.dataset, job.digest, trouble)
 
 
 def use(job: AdapterJob, model: ReconstructionModel, out: Path, epoch: int | None) -> Adapter:
@@ -170,7 +179,7 @@ def _usable_scenes(job: AdapterJob, model: ReconstructionModel, data: Path) -> t
     return scenes, problems
 
 
-def _facts(result: Adapted, model: ReconstructionModel, recipe: Recipe, peak_gb: float) -> dict[str, float]:
+def _facts(result: Adapted, model: ReconstructionModel, recipe: Recipe, peak_gb: float) -> dict[str, Any]:
     change = result.loss_change()
     return {
         "steps": len(result.curve),
@@ -179,4 +188,5 @@ def _facts(result: Adapted, model: ReconstructionModel, recipe: Recipe, peak_gb:
         "trainable": count_trainable(model, recipe.rank),
         "first_loss": change["first"],
         "last_loss": change["last"],
+        "trouble": result.trouble,
     }

@@ -30,7 +30,7 @@ def predict_on_cluster(
         raise UserError("--cluster needs ray: pip install 'freegeo[cluster]'.") from None
     if not ray.is_initialized():
         ray.init(log_to_driver=False)
-    resources = {"num_gpus": 1} if predictor.compute.device.type == "cuda" else {"num_cpus": 1}
+    resources = {"num_gpus": 1} if predictor.chosen.device.type == "cuda" else {"num_cpus": 1}
     waiting = predictor.unfinished(tasks)
     problems: list[Problem] = []
     for work, items in ((_adapt, predictor.adapter_jobs(waiting)), (_predict, waiting)):

@@ -66,9 +66,10 @@ def estimate(predictor: Predictor, tasks: Sequence[Task]) -> Cost:
     steps, seconds_of_step = 0, 0.0
     if jobs:
         steps = sum(job.steps([SAMPLE * 2] * len(job.scenes)) for job in jobs)
-        noise = predictor.noise(SAMPLE)
-        scene = SceneImages(name="noise", count=SAMPLE, load=lambda frames: noise[list(frames)])
-        seconds_of_step = _seconds_of_step(predictor, scene, jobs[0].recipe.changed(steps=MEASURED_STEPS))
+        recipe = jobs[0].recipe.changed(steps=MEASURED_STEPS)
+        noise = predictor.noise(max(SAMPLE, recipe.views))
+        scene = SceneImages(name="noise", count=len(noise), load=lambda frames: noise[list(frames)])
+        seconds_of_step = _seconds_of_step(predictor, scene, recipe)
     return Cost(
         passes=passes, seconds_of_pass=seconds, adapters=len(jobs), steps=steps, seconds_of_step=seconds_of_step
     )
@@ -150,7 +151,7 @@ def _seconds_of_step(predictor: Predictor, scene: SceneImages, recipe: Recipe) -
     """Mean duration of the steps after the first, which also includes one-time work."""
     times: list[float] = []
     result = adapt(
-        predictor.model, [scene], recipe, seed=predictor.setup.adapt_seed, compute=predictor.compute,
+        predictor.model, [scene], recipe, seed=predictor.setup.adapt_seed, compute=predictor.chosen,
         on_step=lambda _: times.append(time.perf_counter()),
     )  # fmt: skip
     result.adapter.detach()

@@ -49,6 +49,8 @@ from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
 AdaptPer = Literal["dataset", "scene"]
 DEFAULT_ROW = "procedural"
 """Row of adaptation settings for a dataset without published ones."""
+EVALUATED_IN: Mapping[str | None, Precision] = {"da3": "bf16", "vggt": "fp32"}
+"""Arithmetic of the released evaluation of a model family on a GPU; the adaptation's is the recipe's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +83,8 @@ class Predictor:
 
     def __init__(self, setup: Setup):
         self.setup = setup
-        self.compute = Compute.choose(setup.device, setup.precision)
+        self.chosen = Compute.choose(setup.device, setup.precision)
+        """As the run's options say; predictions are made with `compute`."""
         self._in_place: tuple[str, Adapter] | None = None
         self._load = lru_cache(maxsize=8)(partial(load_scene, setup.data))
 
@@ -89,7 +92,12 @@ class Predictor:
     def model(self) -> ReconstructionModel:
         """The model, loaded on first use."""
         model = load_model(self.setup.model, checkpoint=self.setup.checkpoint)
-        return model.to(self.compute.device).eval()
+        return model.to(self.chosen.device).eval()
+
+    @cached_property
+    def compute(self) -> Compute:
+        """Device and precision of predictions: by default the precision of the model family's released evaluation."""
+        return self.chosen.preferring(EVALUATED_IN.get(self.model.spec.adaptation.published))
 
     def configuration(self, task: Task) -> dict[str, Any]:
         """Everything but the task itself that decides its prediction."""
@@ -104,8 +112,9 @@ class Predictor:
             return None
         scenes = (task.scene,) if self.setup.adapt_per == "scene" else self.setup.scenes.get(task.dataset, ())
         recipe = kind.recipe(self.recipe(task.dataset))
+        base = {**self._base(), "precision": self.chosen.preferring(recipe.precision).precision}
         return AdapterJob(
-            dataset=task.dataset, scenes=tuple(scenes), recipe=recipe, seed=self.setup.adapt_seed, base=self._base()
+            dataset=task.dataset, scenes=tuple(scenes), recipe=recipe, seed=self.setup.adapt_seed, base=base
         )
 
     def recipe(self, dataset: str) -> Recipe:
@@ -114,7 +123,8 @@ class Predictor:
         A dataset without published settings takes those of generated rooms (docs/benchmark.md, "Adding a dataset").
         """
         row = get_dataset(dataset).recipe_row or DEFAULT_ROW
-        return recipes.named(self.setup.recipe, self.model.spec, row).changed(**self.setup.changes)
+        name = self.setup.recipe
+        return recipes.named(name, self.model.spec, None if name == "scene" else row).changed(**self.setup.changes)
 
     def unfinished(self, tasks: Sequence[Task]) -> list[Task]:
         """The tasks that still have to be predicted; UserError when one was made with other settings."""
@@ -132,7 +142,7 @@ class Predictor:
     def adapt(self, job: AdapterJob, on_step: Callable[[Progress], None] = lambda progress: None) -> list[Problem]:
         """Train one adapter; returns the scenes that had to be left out."""
         self._take_off()
-        return train(job, self.model, self.setup.data, self.setup.out, self.compute, on_step)
+        return train(job, self.model, self.setup.data, self.setup.out, self.chosen, on_step)
 
     def predict(self, task: Task) -> None:
         """Carry out one task and store its outcome."""

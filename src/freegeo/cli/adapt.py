@@ -59,7 +59,7 @@ def adapt(
     batches = {name: read_photos(empty, found, mixed=photos.mixed) for name, found in scenes.items()}
     about = {name: {"photos": list(batch.names), "contents": batch.digest()} for name, batch in batches.items()}
     settings = {
-        "command": "adapt", "scenes": about, "published": published, **model.identity(), "recipe": asdict(plan),
+        "command": "adapt", "scenes": about, "published": published, **model.identity(plan), "recipe": asdict(plan),
     }  # fmt: skip
     with run_folder(output.output, settings, overwrite=output.overwrite, labels=LABELS) as folder:
         if folder.finished:

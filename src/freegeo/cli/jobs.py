@@ -94,7 +94,7 @@ def run_job(
     masks = files.checked_masks(photos)
     batch = read_photos(empty, photos, mixed=mixed)
     adaptation = {
-        "photos": list(batch.names), "photo_contents": batch.digest(), **model_options.identity(),
+        "photos": list(batch.names), "photo_contents": batch.digest(), **model_options.identity(plan),
         "recipe": None if plan is None else asdict(plan),
         "adapter": None if adapter is None else adapter_identity(adapter),
     }  # fmt: skip

@@ -99,12 +99,14 @@ class ModelOptions:
         path = self.weights()
         return {"file": path.name, "fingerprint": fingerprint(path)}
 
-    def identity(self) -> dict[str, object]:
-        """Return what an adapter depends on, for comparison with an existing folder."""
+    def identity(self, recipe: Recipe | None) -> dict[str, object]:
+        """Return what a result depends on, for comparison with an existing folder."""
+        compute = self.compute()
         return {
             "model": self.name,
             "checkpoint": self.checkpoint_identity()["fingerprint"],
-            "precision": self.compute().precision,
+            "precision": compute.precision,
+            "precision while adapting": None if recipe is None else compute.preferring(recipe.precision).precision,
             "seed": self.seed,
         }
 

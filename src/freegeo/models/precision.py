@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -22,12 +22,25 @@ class Compute:
 
     device: torch.device = CPU
     precision: Precision = "fp32"
+    by_default: bool = field(default=False, compare=False)
+    """Whether nobody asked for the precision, so that work with a published one may take that (`preferring`)."""
 
     @classmethod
     def choose(cls, device: str | None = None, precision: str | None = None) -> Compute:
         """Return the given device and precision, or the best available; UserError when one is not available."""
         chosen = choose_device(device)
-        return cls(device=chosen, precision=choose_precision(precision, chosen))
+        return cls(device=chosen, precision=choose_precision(precision, chosen), by_default=precision is None)
+
+    def preferring(self, precision: Precision | None) -> Compute:
+        """Return this with the precision of published work, on a CUDA device, where nobody asked for another.
+
+        A device without bf16 takes fp16 instead, as the released evaluation does. None changes nothing.
+        """
+        if precision is None or not self.by_default or self.device.type != "cuda":
+            return self
+        if precision == "bf16" and not torch.cuda.is_bf16_supported():
+            precision = "fp16"
+        return replace(self, precision=choose_precision(precision, self.device))
 
     def autocast(self) -> AbstractContextManager:
         """Return the context that a model's embed and aggregate run in."""

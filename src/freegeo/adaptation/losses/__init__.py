@@ -4,7 +4,7 @@ Reading order: `equations` (the paper, plainly), `sampling` (which tokens), `ass
 forms of the three terms: `intra`, `angles`, `divergence`. The versions are literals in `freegeo.adaptation.recipe`.
 """
 
-from freegeo.adaptation.losses.assemble import adaptation_loss, feature_distance, require_finite, teacher_spread
+from freegeo.adaptation.losses.assemble import adaptation_loss, feature_distance, not_finite, teacher_spread
 from freegeo.adaptation.losses.divergence import KLForm, choose_form
 from freegeo.adaptation.losses.sampling import Level, StepDraws, TokenDraw, draw_tokens, held_out_tokens
 from freegeo.adaptation.recipe import LossConfig
@@ -20,6 +20,6 @@ __all__ = [
     "draw_tokens",
     "feature_distance",
     "held_out_tokens",
-    "require_finite",
+    "not_finite",
     "teacher_spread",
 ]

@@ -232,12 +232,7 @@ def teacher_spread(kept: Level, held_out: Tensor, draws: StepDraws, config: Loss
     return torch.stack([pair_spread(x, q, config.temperature) for x in (p, anchors)]).amax()
 
 
-def require_finite(terms: Mapping[str, Tensor], *, step: int) -> None:
-    """Raise `FreeGeoError` naming the first term of `terms` (scalars) that is not finite; one transfer to the host."""
+def not_finite(terms: Mapping[str, Tensor]) -> str | None:
+    """Return the name of the first term of `terms` (scalars) that is not finite, if any; one transfer to the host."""
     finite = torch.stack([term.detach().float() for term in terms.values()]).isfinite().tolist()
-    for name, is_finite in zip(terms, finite, strict=True):
-        if not is_finite:
-            raise FreeGeoError(
-                f"Loss term {name} is not finite at step {step}: lower the learning rate, or run with "
-                "--precision fp32 to rule out an overflow of half precision."
-            )
+    return next((name for name, is_finite in zip(terms, finite, strict=True) if not is_finite), None)
