@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import torch
 from torch import nn
 
 from freegeo.adaptation import adapt as adapting
-from freegeo.adaptation.adapt import adapt, learning_rate, loss_change
+from freegeo.adaptation.adapt import adapt, learning_rate, loss_change, trouble
 from freegeo.adaptation.adapter import Adapter, PackedDropout
 from freegeo.adaptation.losses import adaptation_loss, draw_tokens, feature_distance
 from freegeo.adaptation.memory import Plan
@@ -21,7 +22,7 @@ from freegeo.adaptation.recipe import paper, released
 from freegeo.adaptation.samples import SceneImages, released_augmentation
 from freegeo.adaptation.state import UNFINISHED_FILE
 from freegeo.adaptation.views import schedule
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import DivergedError, FreeGeoError, UserError
 from freegeo.models.precision import Compute
 from loss_tools import teacher_side
 from tiny_models import PATCH, noise, noise_scene, outputs, quick, same, tensors, tiny_da3, tiny_vggt
@@ -255,6 +256,61 @@ def test_fewer_than_three_views_are_refused_and_leave_the_model_plain():
     run(model, [noise_scene(3)], quick(model, steps=1))
 
 
+@pytest.mark.parametrize(
+    ("views", "changes", "words"),
+    [
+        (
+            10,
+            {"views": 12},
+            "(10) than the 12 views of a view set (--views): the teacher sees all 10, the student views 0",
+        ),
+        (5, {}, "the teacher sees all 5, the student views 0, 2, 4 of them"),
+        (4, {"keep": (0, 5)}, "the student views 0, 2 of them, as --keep 0,5 does not fit"),
+        (4, {"repeat_views": True}, "some are repeated"),
+        (8, {}, ""),
+    ],
+)
+def test_what_is_done_instead_with_few_photos_is_said(views, changes, words, caplog):
+    caplog.set_level("INFO")
+    model = tiny_da3()
+    run(model, [noise_scene(views)], quick(model, steps=1, **changes))
+    assert words in caplog.text
+    assert ("than the" in caplog.text) == bool(words)
+
+
+@pytest.mark.parametrize("seed", [0, 2**40, 2**64 - 1])
+def test_any_seed_of_64_bits_works(seed):
+    model = tiny_da3()
+    assert run(model, [noise_scene(9)], quick(model, steps=1, dropout=0.1), seed=seed).curve
+
+
+def test_a_seed_beyond_64_bits_is_refused_before_anything_else():
+    model = tiny_da3()
+    with pytest.raises(UserError, match="--seed must be from 0"):
+        run(model, [noise_scene(9)], quick(model), seed=2**64)
+    run(model, [noise_scene(9)], quick(model, steps=1))
+
+
+def test_a_default_precision_gives_way_to_the_recipe_s_on_a_gpu(monkeypatch):
+    class PlannedError(Exception):
+        """Ends the run where the precision is known, as there is no GPU."""
+
+    def plan(*args, compute, **options):
+        raise PlannedError(compute.precision)
+
+    monkeypatch.setattr(adapting, "plan_adaptation", plan)
+    model, cuda = tiny_da3(), torch.device("cuda")
+    recipe = paper(model.spec, "eth3d")
+    asked = Compute(device=cuda, precision="bf16")
+    for compute, wanted in (
+        (replace(asked, by_default=True), "fp16"),
+        (asked, "bf16"),
+        (Compute(by_default=True), "fp32"),
+    ):
+        with pytest.raises(PlannedError, match=wanted):
+            run(model, [noise_scene(9)], recipe, compute=compute)
+
+
 def test_epochs_and_steps_are_announced():
     model, steps, epochs = tiny_da3(), [], []
     run(
@@ -336,7 +392,7 @@ def test_a_loss_that_is_not_finite_stops_before_the_optimiser(build, value, monk
     def remember(progress):
         seen.append([parameter.detach().clone() for parameter in adapters[0].parameters()])
 
-    with pytest.raises(FreeGeoError, match="loss term intra is not finite at step 2. Lower --lr") as error:
+    with pytest.raises(FreeGeoError, match=r"loss term intra is not finite at step 2\. Lower --lr") as error:
         run(model, [noise_scene(9)], quick(model), on_step=remember)
     assert not isinstance(error.value, UserError)
     assert len(seen) == 2
@@ -356,6 +412,91 @@ def test_a_gradient_that_is_not_finite_stops_the_run(monkeypatch):
     model = tiny_da3()
     with pytest.raises(FreeGeoError, match="gradient is not finite at step 0"):
         run(model, [noise_scene(9)], quick(model))
+
+
+# Results that should not be used --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lr", [0.3, 1.0, 100.0, 1e30])
+def test_a_loss_that_blows_up_ends_the_run_in_a_sentence_and_leaves_the_model_plain(build, lr):
+    model = build()
+    frozen = outputs(model, IMAGES)
+    with pytest.raises(
+        DivergedError, match=r"^adaptation diverged: .* by step \d+|.* is not finite at step \d+"
+    ) as error:
+        run(model, [noise_scene(9)], quick(model, steps=40, lr=lr))
+    assert str(error.value).endswith(f"Lower --lr (now {lr:g}).")
+    assert same(outputs(model, IMAGES), frozen)
+    Adapter.attach(model, rank=2, alpha=2, dropout=0.0, generator=torch.Generator())
+
+
+@pytest.mark.parametrize(
+    ("steps", "lr", "words"),
+    [
+        (1, 100.0, "worse at its own task"),  # the only update comes after the only loss of the curve
+        (12, 0.1, "worse at its own task"),  # the loss falls again from its peak, to ten times that of the start
+        (3, 1e-30, "gained nothing"),
+        (12, 3e-3, None),
+    ],
+)
+def test_an_adapter_that_is_no_better_than_none_says_so(build, steps, lr, words, tmp_path):
+    model = build()
+    result = run(model, [noise_scene(9)], quick(model, steps=steps, lr=lr))
+    said = result.trouble
+    assert (said is None) == (words is None)
+    if words is not None:
+        assert words in said and f"--lr (now {lr:g})" in said
+        assert "not to be used" in repr(result)
+    result.save(tmp_path)
+    assert json.loads((tmp_path / "freegeo.json").read_text())["trouble"] == said
+
+
+def test_the_look_at_what_came_out_compares_equal_view_sets_and_tokens(build):
+    """With an adapter that changes nothing the two losses are equal to the bit, and equal to that of the last step."""
+    model = build()
+    recipe = quick(model, steps=5, batch=2, lr=1e-30, weight_decay=0.0)
+    result = run(model, [noise_scene(9), noise_scene(5, seed=1)], recipe)
+    assert result.gain["frozen"] == result.gain["adapted"]
+    assert result.gain["adapted"] == pytest.approx(result.curve[-1]["total"], rel=1e-6)
+
+
+def test_a_value_that_is_not_finite_is_found_wherever_it_is(build, tmp_path):
+    model = build()
+    result = run(model, [noise_scene(9)], quick(model, steps=2, lr=1e-3))
+    for name, parameter in result.adapter.named_parameters().items():
+        kept = parameter.detach().flatten()[-1].clone()
+        with torch.no_grad():
+            parameter.view(-1)[-1] = float("nan") if name == "camera_token" else float("inf")
+        assert f"values that are not finite (1 tensors, first {name})" in result.trouble
+        with torch.no_grad():
+            parameter.view(-1)[-1] = kept
+    assert "not finite" not in str(result.trouble)
+    result.gain = {"frozen": 0.5, "adapted": float("inf")}
+    result.save(tmp_path)
+    # Also for readers of JSON that know no infinity.
+    about = json.loads((tmp_path / "freegeo.json").read_text(), parse_constant=pytest.fail)
+    assert about["gain"] == {"frozen": 0.5, "adapted": None}
+
+
+@pytest.mark.parametrize(
+    ("frozen", "adapted", "words"),
+    [
+        (0.5, 0.3, None),
+        (0.5, 0.4994, None),  # three steps at a hundredth of the usual rate
+        (0.5, 0.499999, "gained nothing"),
+        (0.5, 0.500001, "gained nothing"),  # rounding
+        (0.0, 0.0, "gained nothing"),  # copies of one photo
+        (0.5, 0.51, "worse"),
+        (0.0, 1e-9, "worse"),
+        (0.5, 1.6e15, "worse"),
+        (0.5, float("inf"), "is not finite"),
+        (0.5, float("nan"), "is not finite"),
+        (float("nan"), 0.5, "is not finite"),
+    ],
+)
+def test_the_rule_for_what_may_be_used(frozen, adapted, words):
+    said = trouble({"frozen": frozen, "adapted": adapted}, [], quick(tiny_da3()))
+    assert said is None if words is None else words in said
 
 
 # Stopping and going on ------------------------------------------------------------------------------------------------
@@ -385,6 +526,110 @@ def test_an_interrupted_run_goes_on_to_the_same_end(build, at, tmp_path, monkeyp
     assert resumed_steps == list(range(at, 5))
     assert resumed.curve == whole.curve
     assert same(tensors(resumed), tensors(whole))
+
+
+class Stopper:
+    """Sends a signal to this process in the student's n-th pass."""
+
+    def __init__(self, layer: nn.Module, at: int, number: signal.Signals):
+        self.passes, self.at, self.number = 0, at, number
+        layer.register_forward_hook(self)
+
+    def __call__(self, *_):
+        if torch.is_grad_enabled():
+            self.passes += 1
+            if self.passes == self.at:
+                signal.raise_signal(self.number)
+
+
+@pytest.fixture(params=[signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
+def stopping(request, monkeypatch):
+    """A signal and the exception that it raises; for SIGTERM as programs do that exit in an orderly way."""
+    if request.param == signal.SIGINT:
+        return request.param, KeyboardInterrupt
+    before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    request.addfinalizer(lambda: signal.signal(signal.SIGTERM, before))
+    return request.param, SystemExit
+
+
+def last_block(model):
+    return (model.backbone["pretrained"].blocks if hasattr(model, "backbone") else model.aggregator.global_blocks)[-1]
+
+
+@pytest.mark.parametrize("at", [2, 4])
+def test_a_signal_during_a_step_saves_the_state_of_the_step_before(build, at, stopping, tmp_path, caplog):
+    number, error = stopping
+    caplog.set_level("INFO")
+    scenes, model = [noise_scene(9), noise_scene(4, seed=1)], build()
+    recipe = quick(model, steps=5, dropout=0.1)
+    Stopper(last_block(model), at, number)
+    with pytest.raises(error):
+        run(model, scenes, recipe, resume_in=tmp_path)
+    assert f"stopped after step {at - 1} of 5; its state is saved, the same command continues" in caplog.text
+    steps = []
+    resumed = run(build(), scenes, recipe, resume_in=tmp_path, on_step=lambda progress: steps.append(progress.step))
+    whole = run(build(), scenes, recipe)
+    assert steps == list(range(at - 1, 5))
+    assert resumed.curve == whole.curve
+    assert resumed.gain == whole.gain
+    assert same(tensors(resumed), tensors(whole))
+
+
+def test_a_signal_within_an_update_waits_until_that_is_whole(stopping, tmp_path, monkeypatch):
+    number, error = stopping
+    model, step, seen = tiny_da3(), torch.optim.AdamW.step, []
+    recipe = quick(model, steps=5)
+
+    def signalled(self, *args, **options):
+        if len(seen) == 2:
+            signal.raise_signal(number)
+        seen.append(step(self, *args, **options))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(torch.optim.AdamW, "step", signalled)
+        with pytest.raises(error):
+            run(model, [noise_scene(9)], recipe, resume_in=tmp_path)
+    assert len(seen) == 3
+    steps = []
+    resumed = run(tiny_da3(), [noise_scene(9)], recipe, resume_in=tmp_path, on_step=lambda p: steps.append(p.step))
+    assert steps == [3, 4]
+    assert same(tensors(resumed), tensors(run(tiny_da3(), [noise_scene(9)], recipe)))
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_run_that_is_stopped_before_its_first_step_or_without_a_folder_saves_nothing(tmp_path):
+    for at, folder in ((1, tmp_path), (3, None)):
+        model = tiny_da3()
+        Stopper(last_block(model), at, signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            run(model, [noise_scene(9)], quick(model), resume_in=folder)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_in_a_thread_takes_no_signals():
+    """Handlers belong to the main thread."""
+    model, found = tiny_da3(), []
+    thread = threading.Thread(target=lambda: found.append(run(model, [noise_scene(9)], quick(model, steps=1))))
+    thread.start()
+    thread.join()
+    assert len(found) == 1
+
+
+def test_the_seconds_of_a_run_are_those_of_all_its_parts(tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(adapting.time, "monotonic", lambda: clock[0])
+
+    def tick(progress):
+        clock[0] += 10.0
+        if stop and progress.step == 2:
+            raise KeyboardInterrupt
+
+    stop = True
+    with pytest.raises(KeyboardInterrupt):
+        run(model := tiny_da3(), [noise_scene(9)], quick(model, steps=4), resume_in=tmp_path, on_step=tick)
+    stop = False
+    result = run(model := tiny_da3(), [noise_scene(9)], quick(model, steps=4), resume_in=tmp_path, on_step=tick)
+    assert result.seconds == 40.0
 
 
 def test_a_recipe_that_draws_anew_goes_on_to_the_same_end(tmp_path, monkeypatch):
@@ -448,17 +693,18 @@ def test_a_killed_process_s_run_ends_with_the_same_tensors(tmp_path):
     assert same(tensors(resumed), tensors(whole))
 
 
-@pytest.mark.parametrize("changed", ["seed", "recipe", "scenes"])
+@pytest.mark.parametrize("changed", ["seed", "recipe", "scenes", "compute"])
 def test_the_state_of_another_run_is_refused(changed, tmp_path, monkeypatch):
     monkeypatch.setattr(adapting, "SAVE_EVERY_S", -1.0)
     model = tiny_da3()
     recipe = quick(model, steps=2)
     run(model, [noise_scene(9)], recipe, resume_in=tmp_path).adapter.detach()
-    options = {"scenes": [noise_scene(9)], "recipe": recipe, "seed": 42}
+    options = {"scenes": [noise_scene(9)], "recipe": recipe, "seed": 42, "compute": Compute()}
     options |= {
         "seed": {"seed": 1},
         "recipe": {"recipe": recipe.changed(lr=1.0)},
         "scenes": {"scenes": [noise_scene(8)]},
+        "compute": {"compute": Compute(precision="bf16")},
     }[changed]
     with pytest.raises(UserError, match="belongs to another run"):
         run(model, resume_in=tmp_path, **options)

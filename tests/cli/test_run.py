@@ -349,9 +349,10 @@ def test_retrained_adapter_is_another_option(freegeo, photo_folder, tiny, tmp_pa
 # -- interruption
 
 
-@pytest.mark.parametrize("stop_after", [1, 2])
+# A run of two steps reads the loss four times: in every step, and after the last without and with the adapter.
+@pytest.mark.parametrize(("stop_after", "left"), [(1, 3), (2, 2), (4, 0)])
 def test_interrupted_run_continues_to_the_same_result(
-    freegeo, finished, photo_folder, tiny, tmp_path, monkeypatch, stop_after
+    freegeo, finished, photo_folder, tiny, tmp_path, monkeypatch, stop_after, left
 ):
     out, steps = tmp_path / "out", []
     losses = adapting.adaptation_loss
@@ -365,10 +366,9 @@ def test_interrupted_run_continues_to_the_same_result(
             raise KeyboardInterrupt
         return counted(*arguments, **options)
 
-    monkeypatch.setattr(adapting, "SAVE_EVERY_S", -1.0)
     with monkeypatch.context() as patch:
         patch.setattr(adapting, "adaptation_loss", interrupted)
-        if stop_after == 2:
+        if left == 0:
             # Adaptation is complete; the interruption comes while the files are written.
             patch.setattr(formats, "export", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
             patch.setattr("freegeo.pipeline.export", formats.export)
@@ -376,12 +376,12 @@ def test_interrupted_run_continues_to_the_same_result(
     assert outcome.code == 130
     assert "the same command continues" in outcome.sentence()
     assert "reconstruction.json" not in files(out)
-    if stop_after == 1:
+    if left:
         assert (out / "adapter" / UNFINISHED_FILE).is_file()
     steps.clear()
     monkeypatch.setattr(adapting, "adaptation_loss", counted)
     assert freegeo("run", photo_folder, "-o", out, *tiny, *QUICK).code == 0
-    assert len(steps) == (1 if stop_after == 1 else 0)
+    assert len(steps) == left
     assert same(prediction(out), prediction(finished))
     assert files(out) == files(finished)
 
@@ -405,7 +405,8 @@ def test_what_a_killed_process_leaves_continues_to_the_same_result(
     assert (left / "adapter" / UNFINISHED_FILE).is_file()
     outcome = freegeo("run", photo_folder, "-o", left, *tiny, *QUICK)
     assert outcome.code == 0, outcome.err
-    assert len(steps) == 2 + 1
+    # Two steps and the look at what came out, then one step and the look.
+    assert len(steps) == 4 + 3
     assert same(prediction(left), prediction(finished))
     assert files(left) == files(finished)
 

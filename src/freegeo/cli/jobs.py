@@ -31,6 +31,7 @@ LABELS = {
     "photos": "other photos", "photo_contents": _OTHER_CONTENTS, "contents": _OTHER_CONTENTS, "scenes": "other scenes",
     "checkpoint": "other weights", "weights": "another adapter", "folder": "--adapter", "masks": "other masks",
     "command": "the command", "recipe": "--adapt", "name": "--recipe", "sets_per_scene": "--sets",
+    "adapting_precision": "--precision",
     **dict.fromkeys(("alpha", "first_seed", "distinct_seeds", "final_lr", "batch"), "what follows from the recipe"),
     **{
         name: f"--{name}"

@@ -106,7 +106,7 @@ class ModelOptions:
             "model": self.name,
             "checkpoint": self.checkpoint_identity()["fingerprint"],
             "precision": compute.precision,
-            "precision while adapting": None if recipe is None else compute.preferring(recipe.precision).precision,
+            "adapting_precision": None if recipe is None else compute.preferring(recipe.precision).precision,
             "seed": self.seed,
         }
 
