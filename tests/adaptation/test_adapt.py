@@ -565,7 +565,7 @@ def test_a_signal_during_a_step_saves_the_state_of_the_step_before(build, at, st
     Stopper(last_block(model), at, number)
     with pytest.raises(error):
         run(model, scenes, recipe, resume_in=tmp_path)
-    assert f"stopped after step {at - 1} of 5; its state is saved, the same command continues" in caplog.text
+    assert f"stopped after step {at - 1} of 5; the state is saved in {tmp_path}" in caplog.text
     steps = []
     resumed = run(build(), scenes, recipe, resume_in=tmp_path, on_step=lambda progress: steps.append(progress.step))
     whole = run(build(), scenes, recipe)

@@ -24,6 +24,7 @@ from freegeo.benchmark.tasks import (
 )
 from freegeo.data.datasets.registry import load_scene
 from freegeo.errors import UserError
+from tiny_models import tiny_da3
 
 
 def test_given_cameras_change_the_prediction_and_are_scored_with(setup):
@@ -190,3 +191,59 @@ def test_a_room_too_small_to_adapt_to_is_left_out(predictor, monkeypatch):
     assert (problem.scene, problem.stage) == (ROOMS[1], "adapt")
     assert "2 frames" in problem.reason
     assert len(stored_tasks(predictor.setup.out)) == 1
+
+
+@pytest.mark.parametrize(
+    ("family", "recipe", "asked", "evaluated", "adapted"),
+    [
+        ("vggt", "released-vggt", None, "fp32", "fp16"),
+        ("da3", "released-da3", None, "bf16", "fp16"),
+        ("vggt", "paper", None, "fp32", "fp16"),
+        ("vggt", "scene", None, "fp32", "bf16"),
+        (None, "paper", None, "bf16", "fp16"),
+        ("vggt", "released-vggt", "bf16", "bf16", "bf16"),
+    ],
+)
+def test_a_published_model_is_evaluated_and_adapted_in_its_published_precision(
+    setup, monkeypatch, family, recipe, asked, evaluated, adapted
+):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    predictor = Predictor(replace(setup, device="cuda", precision=asked, recipe=recipe))
+    model = tiny_da3()
+    model.spec = replace(model.spec, adaptation=replace(model.spec.adaptation, published=family))
+    predictor.__dict__["model"] = model  # as loaded, but for the move to a GPU that is not there
+    found = predictor.configuration(task("adapted"))
+    assert (found["precision"], found["adaptation"]["precision"]) == (evaluated, adapted)
+    assert predictor.configuration(task("frozen"))["precision"] == evaluated
+
+
+def test_precision_on_a_cpu_is_fp32_for_everything(predictor):
+    found = predictor.configuration(task("adapted"))
+    assert (found["precision"], found["adaptation"]["precision"]) == ("fp32", "fp32")
+
+
+def test_an_adapter_that_should_not_be_used_is_said_in_every_run_and_scored_all_the_same(setup, caplog):
+    broken = replace(setup, changes={"steps": 1, "batch": 1, "lr": 100.0})
+    assert predict_all(Predictor(broken), [task("adapted")]) == []
+    sentence = f"the adapter for {DATASET} "
+    assert [sentence in text and "worse at its own task" in text for text in caplog.messages] == [True]
+    caplog.clear()
+    predictor = Predictor(broken)
+    [job] = predictor.adapter_jobs([task("adapted")])
+    assert predictor.adapt(job) == []
+    assert sentence in caplog.text
+
+
+def test_an_adaptation_that_diverges_is_a_problem_of_its_tasks(setup):
+    lost = replace(setup, changes={"steps": 20, "batch": 1, "lr": 100.0})
+    problems = predict_all(Predictor(lost), [task("adapted"), task("frozen")])
+    assert [problem.stage for problem in problems] == ["adapt", "predict"]
+    assert "adaptation diverged" in problems[0].reason and "Lower --lr (now 100)" in problems[0].reason
+    assert [one.variant for one, _ in stored_tasks(lost.out)] == ["frozen"]
+
+
+def test_recipe_scene_is_the_same_for_every_dataset(setup):
+    recipe = Predictor(replace(setup, recipe="scene")).recipe(DATASET)
+    assert (recipe.name, recipe.steps) == ("scene", 2)

@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 SAVE_EVERY_S = 30.0
 SAME_LOSS = 1e-4
 """Relative difference up to which two losses of the same view sets and tokens are taken for equal: rounding makes 1e-6
-in float32, more in half precision, and a run of three steps at a third of a percent of the usual rate changes 1e-3."""
+in float32, more in half precision, and a run of three steps at a hundredth of the usual rate changes 1e-3."""
 BLOWN_UP = 1e4
 """A loss of so many times the first step's ends a run: no run was seen to come back from there, and steps get slow."""
 CPU = Compute()
@@ -420,8 +420,8 @@ class _State:
             return
         self.save()
         logger.info(
-            "stopped after step %d of %d; its state is saved, the same command continues",
-            self.next_step, len(self.run.steps),
+            "stopped after step %d of %d; the state is saved in %s", self.next_step, len(self.run.steps),
+            self.run.folder,
         )  # fmt: skip
 
     def _restore(self) -> int:

@@ -93,7 +93,7 @@ def train(
     """
     if job.is_finished(out):
         facts = read_json(job.folder(out) / FINISHED)
-        _warn(job, facts["trouble"])
+        _warn(job, facts.get("trouble"))
         return [Problem(**problem) for problem in facts["left_out"]]
     scenes, problems = _usable_scenes(job, model, data)
     folder = job.folder(out)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from cyclopts import Parameter
 
-from freegeo.adaptation.recipe import PAPER, SEED, DatasetName, Recipe, RecipeName, named
+from freegeo.adaptation.recipe import PAPER, SEED, DatasetName, Recipe, RecipeName, named, require_seed
 from freegeo.cli import console
 from freegeo.cli.sources import DEMO
 from freegeo.data.photos import MAX_VIEWS
@@ -82,6 +82,7 @@ class ModelOptions:
         from freegeo.models.reference import require_rule
 
         self.compute()
+        require_seed(self.seed)
         if self.reference is not None:
             require_rule(self.reference)
         return build_empty(self.name)
