@@ -16,12 +16,13 @@ from freegeo.adaptation.adapter import Adapter, is_adapted
 from freegeo.adaptation.recipe import PAPER
 from freegeo.adaptation.state import UNFINISHED_FILE
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.evidence.guard import State, states
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.models import api
 from tiny_models import noise, quick, same, tensors, tiny_da3, trained
 
 VIEWS, SIDE = 4, 32
-QUICK = {"steps": 2, "sets": 2}
+QUICK = {"steps": 2, "sets": 2, "guard": "off"}
 
 
 def pictures(views: int = VIEWS, seed: int = 0) -> list[np.ndarray]:
@@ -204,7 +205,7 @@ def test_the_device_is_the_best_at_hand_unless_one_is_named(model, monkeypatch):
 
 def test_adapting_keeps_the_adapter_on_until_it_is_detached(model):
     before = freegeo.reconstruct(model, pictures())
-    result = freegeo.adapt(model, pictures(), recipe=quick(model))
+    result = freegeo.adapt(model, pictures(), guard="off", recipe=quick(model))
     assert len(result.curve) == 4
     after = freegeo.reconstruct(model, pictures())
     assert not close(before, after)
@@ -218,7 +219,7 @@ def test_adapting_keeps_the_adapter_on_until_it_is_detached(model):
 
 def test_settings_reach_the_recipe_as_on_the_command_line(model):
     result = freegeo.adapt(
-        model, pictures(), steps=3, sets=2, lr=1e-4, rank=2, hold=0.5, views=4, keep=[0, 2],
+        model, pictures(), guard="off", steps=3, sets=2, lr=1e-4, rank=2, hold=0.5, views=4, keep=[0, 2],
         loss={"weight_kq": 0.0, "num_query": 5}, seed=7,
     )  # fmt: skip
     recipe = result.recipe
@@ -230,20 +231,20 @@ def test_settings_reach_the_recipe_as_on_the_command_line(model):
 
 
 def test_recipes_by_name_and_by_hand(model):
-    named = freegeo.adapt(model, pictures(), recipe="paper", dataset="eth3d", epochs=1, sets=1)
+    named = freegeo.adapt(model, pictures(), guard="off", recipe="paper", dataset="eth3d", epochs=1, sets=1)
     assert (named.recipe.name, named.recipe.epochs, named.recipe.batch) == ("paper", 1, PAPER.batch)
     named.adapter.detach()
     for recipe, words in (("best", "unknown recipe 'best'"), (3, "not int"), ("paper", "choose --dataset")):
         with pytest.raises(UserError, match=words):
-            freegeo.adapt(model, pictures(), recipe=recipe)
+            freegeo.adapt(model, pictures(), guard="off", recipe=recipe)
     with pytest.raises(UserError, match="given by name"):
-        freegeo.adapt(model, pictures(), recipe=quick(model), dataset="eth3d")
+        freegeo.adapt(model, pictures(), guard="off", recipe=quick(model), dataset="eth3d")
 
 
 def test_a_recipe_that_squashes_reads_the_photos_itself(model):
-    plain = freegeo.adapt(model, pictures(), recipe=quick(model))
+    plain = freegeo.adapt(model, pictures(), guard="off", recipe=quick(model))
     plain.adapter.detach()
-    squashed = freegeo.adapt(model, pictures(), recipe=quick(model, squash=16))
+    squashed = freegeo.adapt(model, pictures(), guard="off", recipe=quick(model, squash=16))
     assert not same(tensors(plain), tensors(squashed))
 
 
@@ -255,7 +256,7 @@ def test_too_few_photos_to_hold_one_out(model, views):
 
 
 def test_a_run_that_was_stopped_continues(model, tmp_path):
-    whole = freegeo.adapt(model, pictures(), steps=4, sets=2)
+    whole = freegeo.adapt(model, pictures(), guard="off", steps=4, sets=2)
     whole.adapter.detach()
     steps = []
 
@@ -265,8 +266,10 @@ def test_a_run_that_was_stopped_continues(model, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        freegeo.adapt(model, pictures(), steps=4, sets=2, resume_in=str(tmp_path), on_step=stop)
-    rest = freegeo.adapt(model, pictures(), steps=4, sets=2, resume_in=tmp_path, on_step=lambda p: steps.append(p.step))
+        freegeo.adapt(model, pictures(), guard="off", steps=4, sets=2, resume_in=str(tmp_path), on_step=stop)
+    rest = freegeo.adapt(
+        model, pictures(), guard="off", steps=4, sets=2, resume_in=tmp_path, on_step=lambda p: steps.append(p.step)
+    )
     assert steps == [0, 1, 2, 3]
     assert same(tensors(whole), tensors(rest))
     rest.save(str(tmp_path))
@@ -319,3 +322,84 @@ def test_results_are_stored_and_opened(model, tmp_path):
     assert opened.names == found.names
     with pytest.raises(UserError, match="holds no reconstruction"):
         freegeo.open_reconstruction(tmp_path / "nowhere")
+
+
+# -- guard
+
+
+@pytest.fixture
+def judged(monkeypatch):
+    """Replaces the matches between photos by a verdict of choice; returns what is to be set and what was predicted."""
+    from freegeo import guarded
+    from freegeo.evidence.guard import Measurement, Trial, Verdict
+    from freegeo.evidence.scores import PairScores
+
+    nothing = PairScores(pairs=np.zeros((0, 2), np.int64), values=np.zeros(0), used=np.zeros(0, np.int64), reason="x")
+    measured = Measurement(
+        epipolar=nothing, reprojection=nothing, drift=0.0, agreement=1.0, agreement_before=1.0
+    )  # fmt: skip
+    told = {"state": None, "outcome": "frozen", "tried": []}
+
+    def verdict(predict, references, **options):
+        for state in states():
+            told["tried"].append((state, predict(state)[0].depth_z.clone()))
+        chosen = None
+        if told["state"] is not None:
+            chosen = Trial(state=told["state"], measured=measured, gain=1.0, spread=0.1, probability=1.0, veto=None)
+        trials = () if chosen is None else (chosen,)
+        return Verdict(outcome=told["outcome"], reason="Because.", frozen=measured, trials=trials, chosen=chosen)
+
+    monkeypatch.setattr(guarded, "try_states", verdict)
+    return told
+
+
+@pytest.mark.parametrize("state", [(1.0, 1.0), (1.0, 0.5), (0.5, 1.0)])
+def test_the_state_that_the_guard_chose_is_the_adapter(model, tmp_path, judged, state):
+    judged |= {"state": State(steps=state[0], strength=state[1]), "outcome": "adapted"}
+    result = freegeo.adapt(model, pictures(), steps=4, sets=2, lr=1e-2)
+    expected = dict(judged["tried"])[judged["state"]].numpy()
+    used = freegeo.reconstruct(model, pictures()).depth_z
+    assert np.allclose(used, expected, atol=1e-6)
+    assert len({round(float(depth.sum()), 4) for _, depth in judged["tried"]}) == 7
+    assert result.verdict is not None and result.verdict["outcome"] == "adapted"
+    result.save(tmp_path)
+    result.adapter.detach()
+    assert np.allclose(freegeo.reconstruct(model, pictures(), adapter=tmp_path).depth_z, used, atol=1e-6)
+
+
+@pytest.mark.parametrize("outcome", ["frozen", "unknown"])
+def test_an_adapter_that_the_guard_refuses_has_no_strength(model, judged, outcome):
+    before = freegeo.reconstruct(model, pictures())
+    judged["outcome"] = outcome
+    result = freegeo.adapt(model, pictures(), steps=4, sets=2, lr=1e-2)
+    assert close(freegeo.reconstruct(model, pictures()), before)
+    result.adapter.set_strength(1.0)
+    assert not close(freegeo.reconstruct(model, pictures()), before)
+
+
+def test_a_guard_that_reports_changes_nothing(model, judged):
+    result = freegeo.adapt(model, pictures(), steps=4, sets=2, lr=1e-2, guard="report")
+    reported = tensors(result)
+    result.adapter.detach()
+    plain = freegeo.adapt(model, pictures(), steps=4, sets=2, lr=1e-2, guard="off")
+    assert result.verdict is not None and plain.verdict is None
+    assert result.adapter.strength == 1
+    assert same(reported, tensors(plain))
+
+
+def test_states_on_the_way_outlive_a_stop(model, tmp_path, judged):
+    def stop(progress):
+        if progress.step == 2:
+            raise KeyboardInterrupt
+
+    settings = {"steps": 4, "sets": 2, "lr": 1e-2}
+    with pytest.raises(KeyboardInterrupt):
+        freegeo.adapt(model, pictures(), **settings, resume_in=tmp_path, on_step=stop)
+    rest = freegeo.adapt(model, pictures(), **settings, resume_in=tmp_path)
+    continued = judged["tried"].copy()
+    rest.adapter.detach()
+    judged["tried"].clear()
+    freegeo.adapt(model, pictures(), **settings)
+    for (state, one), (other, two) in zip(continued, judged["tried"], strict=True):
+        assert state == other
+        assert torch.equal(one, two)

@@ -25,8 +25,10 @@ from freegeo.adaptation.adapter_files import ADAPTER_FOLDER, METADATA
 from freegeo.adaptation.memory import plan_reconstruction
 from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Recipe
 from freegeo.adaptation.samples import SceneImages
+from freegeo.adaptation.state import remove_state
 from freegeo.data.photos import MAX_VIEWS, load_photos
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import DivergedError, FreeGeoError, UserError
+from freegeo.evidence.guard import SHARES
 from freegeo.export.base import DEFAULT_FORMATS
 from freegeo.export.formats import export, filter_reconstruction
 from freegeo.export.kept import Filtered, save_kept
@@ -38,6 +40,7 @@ from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import FORMAT, as_json, read_json, write_json
 from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
+from freegeo.guarded import Evidence, Guard, judge_adapter
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import EMBEDDED_MODEL, warn_of_embedded_model
 from freegeo.models.images import read_photos
@@ -56,7 +59,8 @@ logger = logging.getLogger(__name__)
 SUMMARY_NAME = "reconstruction.json"
 FROZEN_FOLDER = "frozen"
 FILES_STAGE = "points and files"
-ADAPTATION = Part("adaptation", (f"{ADAPTER_FOLDER}/",))
+MATCHES_NAME = "matches.npz"
+ADAPTATION = Part("adaptation", (f"{ADAPTER_FOLDER}/", MATCHES_NAME))
 PREDICTION = Part("prediction", (f"{FROZEN_FOLDER}/{PREDICTION_NAME}", PREDICTION_NAME, f"{COPIES_FOLDER}/"))
 FILTERS = Part("filters", ("",), free=True)
 FORMATS = Part("formats", (), free=True)
@@ -197,6 +201,7 @@ def adapt(
     precision: str | None = None,
     max_views: int = MAX_VIEWS,
     mixed: Mixed = MIXED,
+    guard: Guard = "select",
     resume_in: str | Path | None = None,
     progress: bool = False,
     on_step: Callable[[Progress], None] = lambda progress: None,
@@ -224,6 +229,8 @@ def adapt(
         precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
         max_views: most photos that are used; a list that `freegeo.load_photos` returned is used whole.
         mixed: how photos of different shapes become images of one size, as for `reconstruct`.
+        guard: `select`: matches between the photos decide in which state the adapter is used, and whether at all (its
+            strength is 0 then; `result.verdict` says why); `report`: they are only asked; `off`.
         resume_in: folder for the state of an unfinished run: the same call continues it. `result.save` to that folder
             removes the state.
         progress: show a bar in a terminal or notebook, lines in a log file; without it nothing is printed.
@@ -242,10 +249,62 @@ def adapt(
     )  # fmt: skip
     found = load_photos(photos, max_views)
     require_enough_photos(found)
-    scene = scene_images("photos", found, model, plan, read_photos(model, found, mixed=mixed))
+    batch = read_photos(model, found, mixed=mixed)
+    scene = scene_images("photos", found, model, plan, batch)
     folder = None if resume_in is None else Path(resume_in).expanduser()
     with step_bar(on_step) if progress else nullcontext(on_step) as follow:
-        return train_adapter(model, [scene], plan, seed=seed, compute=compute, resume_in=folder, on_step=follow)
+        result = train_adapter(
+            model, [scene], plan, seed=seed, compute=compute, resume_in=folder, on_step=follow,
+            keep_after=() if guard == "off" else SHARES,
+        )  # fmt: skip
+    if result.trouble:
+        logger.warning("%s%s", result.trouble[0].upper(), result.trouble[1:])
+    elif guard != "off":
+        judge_by_photos(model, result, [(found, batch)], compute=compute, select=guard == "select")
+    return result
+
+
+def judge_by_photos(
+    model: ReconstructionModel,
+    result: Adapted,
+    scenes: Sequence[tuple[Sequence[PhotoLike], ImageBatch]],
+    *,
+    compute: Compute,
+    select: bool,
+    reference: str | None = None,
+    frozen: Sequence[Reconstruction] | None = None,
+    stores: Sequence[Path | None] | None = None,
+) -> None:
+    """Let the guard judge a finished adapter by the photos of its scenes, and keep its verdict in the result.
+
+    Args:
+        model: with the adapter.
+        result: the finished run; `verdict` is set, and with `select` the adapter is brought into the chosen state. A
+            model without cameras cannot be judged; nothing is changed then.
+        scenes: photos, and the same as images for the model.
+        compute: where predictions are made.
+        select: see `freegeo.guarded.judge_adapter`.
+        reference: rule of the reference view.
+        frozen: predictions without the adapter; None: they are made here.
+        stores: files for the matches of the scenes; None: they are not stored.
+    """
+
+    def predicted(batch: ImageBatch) -> Reconstruction | None:
+        found = _predict(model, batch, reference=reference, compute=compute)
+        return found if not_finite(found) is None else None
+
+    if frozen is None:
+        with result.adapter.off():
+            frozen = [predict(model, batch, reference=reference, compute=compute) for _, batch in scenes]
+    if not all(one.has_cameras for one in frozen):
+        return
+    evidence = [
+        Evidence(photos=photos, batch=batch, frozen=before, store=store)
+        for (photos, batch), before, store in zip(scenes, frozen, stores or [None] * len(scenes), strict=True)
+    ]
+    verdict = judge_adapter(result, evidence, predicted, device=str(compute.device), select=select)
+    logger.info("%s", verdict.reason)
+    result.verdict = verdict.as_dict()
 
 
 def _recipe(recipe: str | Recipe, model: ReconstructionModel, dataset: str | None) -> Recipe:
@@ -313,6 +372,8 @@ class Job:
     """Makes the images to adapt to (`scene_images`); needed with a recipe."""
     adapter: Path | None = None
     """A saved adapter to reconstruct with, instead of training one."""
+    guard: Guard = "select"
+    """Whether the photos' matches judge the adapter, and whether their verdict decides what is used."""
     seed: int = SEED
     compute: Compute = CPU
     reference: str | None = None
@@ -344,24 +405,32 @@ class Job:
         """The adapter of the result, trained or loaded; attached to the model and switched on when first used."""
         if self.recipe is not None:
             return adapter_files.load_adapter(self.model, self.folder / ADAPTER_FOLDER)
-        return None if self.adapter is None else adapter_files.load_adapter(self.model, self.adapter)
+        if self.adapter is None:
+            return None
+        about = adapter_files.adapter_metadata(self.adapter) or {}
+        verdict = about.get("verdict") or {}
+        doubt = about.get("trouble") or (verdict.get("reason") if verdict.get("outcome") != "adapted" else None)
+        if doubt:
+            self._warn(f"{self.adapter}: an adapter to be doubted. {doubt[0].upper()}{doubt[1:]}")
+        return adapter_files.load_adapter(self.model, self.adapter)
 
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
-        frozen, rejected = None, None
-        if self.recipe is not None:
-            frozen = self._predicted(self.folder / FROZEN_FOLDER, "frozen prediction")
-            rejected = self._trained(self.recipe)
-        if frozen is not None and rejected is None:
-            final, rejected = self._adapted_prediction(frozen)
-        elif frozen is not None:
-            final = self._kept(frozen)
-        else:
+        frozen, rejected, verdict = None, None, None
+        if self.recipe is None:
             final = self._predicted(self.folder.path, "adapted prediction" if self.adapter else "prediction")
+        else:
+            frozen = self._predicted(self.folder / FROZEN_FOLDER, "frozen prediction")
+            rejected, verdict = self._trained(self.recipe, frozen)
+            final = frozen
+            if rejected is None and not (verdict and self.guard == "select" and verdict["outcome"] != "adapted"):
+                final, rejected = self._adapted_prediction(frozen)
         if rejected is not None:
-            self._warn(f"{rejected} The result is that of the frozen model.")
+            self._warn(f"{rejected[0].upper()}{rejected[1:]} The result is that of the frozen model.")
+        if final is frozen:
+            final.save(self.folder.path)
         report, failed = self._export(final, frozen)
-        summary = self._summary(final, frozen, report, rejected, failed)
+        summary = self._summary(final, frozen, report, rejected, verdict, failed)
         write_json(self.folder / SUMMARY_NAME, summary)
         self.after(self)
         self.hooks.stage("report")
@@ -380,26 +449,49 @@ class Job:
             result.save(folder)
         return result
 
-    def _trained(self, recipe: Recipe) -> str | None:
-        """Train the adapter, or continue training it, unless it is finished; returns why it cannot be used."""
+    def _trained(self, recipe: Recipe, frozen: Reconstruction) -> tuple[str | None, dict[str, Any] | None]:
+        """Train the adapter, or continue training it, unless it is finished, and let the guard judge it.
+
+        Returns why it cannot be used, and the verdict; both may be None.
+        """
         folder = self.folder / ADAPTER_FOLDER
+        noted = self._noted("adaptation")
+        if "diverged" in noted:
+            return noted["diverged"], None
         if not (folder / METADATA).is_file():
             assert self.scene is not None
             self.hooks.stage("adaptation")
-            result = train_adapter(
-                self.model, [self.scene(self.model)], recipe, seed=self.seed, compute=self.compute, resume_in=folder,
-                on_step=self.hooks.step,
-            )  # fmt: skip
-            result.save(folder)
+            try:
+                result = train_adapter(
+                    self.model, [self.scene(self.model)], recipe, seed=self.seed, compute=self.compute,
+                    resume_in=folder, on_step=self.hooks.step, keep_after=() if self.guard == "off" else SHARES,
+                )  # fmt: skip
+            except DivergedError as error:
+                remove_state(folder)
+                self.folder.note("adaptation", {**noted, "diverged": str(error)})
+                return str(error), None
             self.in_place = result.adapter
-            self.folder.note("adaptation", {"seconds": {"adaptation": round(result.seconds, 2)}})
-        return read_json(folder / METADATA).get("trouble")
+            seconds = {"adaptation": round(result.seconds, 2)}
+            if self.guard != "off" and self.photos is not None and result.trouble is None:
+                self.hooks.stage("evidence of the photos")
+                started = time.monotonic()
+                judge_by_photos(
+                    self.model, result, [(self.photos, self.batch)], compute=self.compute,
+                    select=self.guard == "select", reference=self.reference, frozen=[frozen],
+                    stores=[self.folder / MATCHES_NAME],
+                )  # fmt: skip
+                seconds["evidence"] = round(time.monotonic() - started, 2)
+            result.save(folder)
+            self.folder.note("adaptation", {"seconds": seconds})
+        metadata = read_json(folder / METADATA)
+        return metadata.get("trouble"), metadata.get("verdict")
 
     def _adapted_prediction(self, frozen: Reconstruction) -> tuple[Reconstruction, str | None]:
         """Predict with the trained adapter; the frozen prediction and the reason when that gives no usable numbers."""
         path = self.folder.path
         if (path / PREDICTION_NAME).is_file():
-            return Reconstruction.load(path), self._noted("prediction").get("rejected")
+            rejected = self._noted("prediction").get("rejected")
+            return (Reconstruction.load(path), None) if rejected is None else (frozen, rejected)
         assert self.in_place is not None
         with self._timed("adapted prediction"):
             result = _predict(self.model, self.batch, reference=self.reference, compute=self.compute)
@@ -410,12 +502,7 @@ class Job:
             return result, None
         rejected = f"With the adapter: {rejected}"
         self.folder.note("prediction", {**self._noted("prediction"), "rejected": rejected})
-        return self._kept(frozen), rejected
-
-    def _kept(self, frozen: Reconstruction) -> Reconstruction:
-        """Make the frozen prediction the result."""
-        frozen.save(self.folder.path)
-        return frozen
+        return frozen, rejected
 
     def _warn(self, sentence: str) -> None:
         """Log a warning that reconstruction.json must hold, whoever listens to the log."""
@@ -453,9 +540,10 @@ class Job:
         frozen: Reconstruction | None,
         report: FilterReport | None,
         rejected: str | None,
+        verdict: Mapping[str, Any] | None,
         failed: Mapping[str, str],
     ) -> dict[str, Any]:
-        trained = self.recipe is not None and rejected is None
+        trained = self.recipe is not None and final is not frozen
         settings = dict(self.folder.settings)
         seconds = {name: value for part in self.folder.notes.values() for name, value in part["seconds"].items()}
         return {
@@ -467,7 +555,8 @@ class Job:
             "photo_files": None if self.photos is None else photo_records(self.photos),
             "image_hw": list(final.image_hw),
             "adapter": ADAPTER_FOLDER if trained else (str(self.adapter) if self.adapter else None),
-            "rejected_adapter": rejected,
+            "rejected_adapter": None if trained or self.recipe is None else rejected or (verdict or {}).get("reason"),
+            "verdict": verdict,
             "frozen_prediction": f"{FROZEN_FOLDER}/{PREDICTION_NAME}" if frozen is not None else None,
             "reference_view": self.reference or self.spec.reference,
             "not_written": dict(failed),

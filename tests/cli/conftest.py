@@ -13,7 +13,7 @@ from freegeo.data.procedural import render, sample_rooms
 from freegeo.models.da3_config import EMBEDDED_WEIGHTS
 
 PHOTOS = 4
-QUICK = ["--steps", "2", "--sets", "2"]
+QUICK = ["--steps", "2", "--sets", "2", "--guard", "off"]
 
 
 @dataclass(frozen=True)

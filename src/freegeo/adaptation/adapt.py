@@ -69,6 +69,10 @@ class Adapted:
     """Loss terms of every step."""
     gain: dict[str, float] = field(default_factory=dict)
     """Total loss of the last step's view sets: `frozen` without the adapter, `adapted` with it, equal tokens drawn."""
+    earlier: dict[float, dict[str, Tensor]] = field(default_factory=dict)
+    """The adapter after the shares of the steps that `adapt` was told to keep, as `Adapter.load` takes it."""
+    verdict: Mapping[str, Any] | None = None
+    """What the matches between the photos say (`freegeo.evidence.guard.Verdict.as_dict`); None: nobody asked."""
     seconds: float = 0.0
     """Duration, with that of the earlier parts of a run that was continued."""
     precision: str = "fp32"
@@ -98,6 +102,7 @@ class Adapted:
             # JSON has no infinity.
             "gain": {name: value if math.isfinite(value) else None for name, value in self.gain.items()},
             "trouble": self.trouble,
+            "verdict": self.verdict,
             "seconds": round(self.seconds, 2),
         }
 
@@ -172,6 +177,7 @@ def adapt(
     resume_in: Path | None = None,
     on_step: Callable[[Progress], None] = lambda progress: None,
     on_epoch: Callable[[int, Adapter], None] = lambda epoch, adapter: None,
+    keep_after: Sequence[float] = (),
 ) -> Adapted:
     """Train an adapter on the scenes' images; afterwards it is attached to the model and on.
 
@@ -186,6 +192,7 @@ def adapt(
             the run; on the CPU it ends with the same tensors as a run without a stop.
         on_step: called after every step.
         on_epoch: called after every epoch with its number and the adapter.
+        keep_after: shares of the steps, between 0 and 1, after which the adapter's state is kept (`Adapted.earlier`).
 
     Raises:
         UserError: scenes that are too small, a state of another run, or a run that does not fit into memory.
@@ -198,7 +205,8 @@ def adapt(
         logger.info(said)
     steps = schedule([scene.count for scene in scenes], recipe, seed)
     plan = plan or plan_adaptation(model, scenes, recipe, visited(steps), compute=compute, folder=resume_in)
-    run = _Run(model.adaptable(), scenes, recipe, steps, seed, compute, resume_in, on_step, on_epoch)
+    wanted = {max(1, round(share * len(steps))): share for share in keep_after}
+    run = _Run(model.adaptable(), scenes, recipe, steps, seed, compute, resume_in, on_step, on_epoch, wanted)
     try:
         return _train(run, plan)
     except torch.OutOfMemoryError:
@@ -214,7 +222,7 @@ def adapt(
     smallest = Plan(checkpointing=True, place="disk")
     return adapt(
         model, scenes, recipe, seed=seed, compute=compute, plan=smallest, resume_in=resume_in, on_step=on_step,
-        on_epoch=on_epoch,
+        on_epoch=on_epoch, keep_after=keep_after,
     )  # fmt: skip
 
 
@@ -231,6 +239,8 @@ class _Run:
     folder: Path | None
     on_step: Callable[[Progress], None]
     on_epoch: Callable[[int, Adapter], None]
+    keep_after: Mapping[int, float]
+    """Numbers of finished steps after which the adapter's state is kept -> their share of the steps."""
 
 
 def _train(run: _Run, plan: Plan) -> Adapted:
@@ -382,6 +392,9 @@ class _State:
         self.scaler.step(self.optimiser)
         self.scaler.update()
         self.next_step += 1
+        if share := self.run.keep_after.get(self.next_step):
+            named = self.result.adapter.named_parameters()
+            self.result.earlier[share] = {name: value.detach().cpu().clone() for name, value in named.items()}
 
     def read_terms(self) -> None:
         """Move the loss terms that are still on the device to the curve; DivergedError when they show a lost run."""
@@ -412,7 +425,7 @@ class _State:
             "identity": self._identity(), "next_step": self.next_step, "curve": self.result.curve,
             "seconds": self.seconds(), "scaler": self.scaler.state_dict(),
         }  # fmt: skip
-        write_state(self.run.folder, self.result.adapter, self.optimiser, about)
+        write_state(self.run.folder, self.result.adapter, self.optimiser, about, earlier=self.result.earlier)
 
     def save_stopped(self) -> None:
         """Write the state of a run that is being stopped, if it has a folder and a step to its name, and say so."""
@@ -433,6 +446,7 @@ class _State:
             return 0
         self.scaler.load_state_dict(about["scaler"])
         self.result.curve, self.result.seconds = about["curve"], about["seconds"]
+        self.result.earlier = about["earlier"]
         return about["next_step"]
 
     def _identity(self) -> str:
@@ -441,4 +455,5 @@ class _State:
         model, recipe = self.run.model.spec.name, asdict(self.run.recipe)
         about = {"model": model, "scenes": scenes, "recipe": recipe, "seed": self.run.seed}
         about["precision"] = self.run.compute.precision
+        about["keep_after"] = sorted(self.run.keep_after.values())
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]

@@ -218,6 +218,15 @@ class Adapter:
         if self.is_on:
             self._install_token(self._token)
 
+    @torch.no_grad()
+    def settle(self) -> None:
+        """Make the present strength the adapter's own: its values change, its effect does not, its strength is 1."""
+        for layer in self.layers.values():
+            _matrices(layer)[1].mul_(self.strength)
+        if self.camera_token is not None and self._token is not None:
+            self.camera_token.copy_(self._token)
+        self.set_strength(1.0)
+
     def merge(self) -> ReconstructionModel:
         """Add the adapter (at its strength) to the weights and return the plain model; it cannot be used again."""
         self.reattach()

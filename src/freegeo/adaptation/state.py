@@ -17,11 +17,19 @@ from freegeo.errors import UserError
 from freegeo.files import write_tensors
 
 UNFINISHED_FILE = "adapting.safetensors"
+_EARLIER = "earlier|"
 
 
-def write_state(folder: Path, adapter: Adapter, optimiser: torch.optim.Optimizer, about: Mapping[str, Any]) -> None:
-    """Write the state into a folder; the file is replaced atomically."""
-    tensors = {}
+def write_state(
+    folder: Path,
+    adapter: Adapter,
+    optimiser: torch.optim.Optimizer,
+    about: Mapping[str, Any],
+    *,
+    earlier: Mapping[float, Mapping[str, torch.Tensor]],
+) -> None:
+    """Write the state into a folder, with states of the adapter after shares of the steps; replaced atomically."""
+    tensors = {f"{_EARLIER}{share}|{name}": value for share, state in earlier.items() for name, value in state.items()}
     for name, parameter in adapter.named_parameters().items():
         tensors[name] = parameter
         for key, value in optimiser.state[parameter].items():
@@ -32,7 +40,9 @@ def write_state(folder: Path, adapter: Adapter, optimiser: torch.optim.Optimizer
 def read_state(
     folder: Path, adapter: Adapter, optimiser: torch.optim.Optimizer, identity: str
 ) -> dict[str, Any] | None:
-    """Load a saved state into the adapter and its optimiser and return the facts; None when there is no file.
+    """Load a saved state into the adapter and its optimiser and return the facts, among them the `earlier` states.
+
+    None when there is no file.
 
     UserError for a damaged file, and for the state of another run: one whose facts have another `identity`.
     """
@@ -58,6 +68,11 @@ def read_state(
             for key, value in tensors.items()
             if key.startswith(f"{name}|")
         }
+    about["earlier"] = {}
+    for key, value in tensors.items():
+        if key.startswith(_EARLIER):
+            share, _, name = key.removeprefix(_EARLIER).partition("|")
+            about["earlier"].setdefault(float(share), {})[name] = value
     return about
 
 

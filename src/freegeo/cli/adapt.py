@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from freegeo.cli import console
 from freegeo.cli.jobs import LABELS, check_place, say_finished
-from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
+from freegeo.cli.options import Guard, ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source, split_scenes
 from freegeo.progress import step_bar
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from freegeo.adaptation.recipe import Recipe
     from freegeo.adaptation.samples import SceneImages
     from freegeo.models.api import ReconstructionModel
+    from freegeo.types import ImageBatch, PhotoLike
 
 DEFAULT_RECIPE, DEFAULT_MODEL, DEFAULT_PHOTOS = RecipeOptions(), ModelOptions(), PhotoOptions()
 FILES = {
@@ -35,6 +37,7 @@ def adapt(
     recipe: RecipeOptions = DEFAULT_RECIPE,
     photos: PhotoOptions = DEFAULT_PHOTOS,
     published: bool = False,
+    guard: Guard = "select",
 ) -> None:
     """Adapt a model to scenes; several folders make one adapter for all of them.
 
@@ -44,6 +47,9 @@ def adapt(
         Folders of photos (each a scene), globs in quotes, photo files (together one scene), videos, or `demo`.
     published
         Also write the adapter in the layout of the authors' release, below `published`.
+    guard
+        select: matches between the photos decide which state of the adapter is saved; report: they are only asked;
+        off.
     """
     from freegeo.models.images import read_photos
     from freegeo.pipeline import require_enough_photos, scene_images
@@ -59,7 +65,8 @@ def adapt(
     batches = {name: read_photos(empty, found, mixed=photos.mixed) for name, found in scenes.items()}
     about = {name: {"photos": list(batch.names), "contents": batch.digest()} for name, batch in batches.items()}
     settings = {
-        "command": "adapt", "scenes": about, "published": published, **model.identity(plan), "recipe": asdict(plan),
+        "command": "adapt", "scenes": about, "published": published, "guard": guard, **model.identity(plan),
+        "recipe": asdict(plan),
     }  # fmt: skip
     with run_folder(output.output, settings, overwrite=output.overwrite, labels=LABELS) as folder:
         if folder.finished:
@@ -67,7 +74,8 @@ def adapt(
             return
         loaded = model.load()
         images = [scene_images(name, scenes[name], loaded, plan, batch) for name, batch in batches.items()]
-        _train(loaded, images, plan, model, folder.path, published=published)
+        pairs = [(found, batches[name]) for name, found in scenes.items()]
+        _train(loaded, images, plan, model, folder.path, published=published, guard=guard, scenes=pairs)
         folder.finish()
     console.written(output.output, FILES)
 
@@ -80,9 +88,14 @@ def _train(
     folder: Path,
     *,
     published: bool,
+    guard: Guard,
+    scenes: Sequence[tuple[Sequence[PhotoLike], ImageBatch]],
 ) -> None:
     from freegeo.adaptation.adapt import adapt as train_adapter
     from freegeo.adaptation.adapter_files import export_published, save_adapter
+    from freegeo.errors import FreeGeoError
+    from freegeo.evidence.guard import SHARES
+    from freegeo.pipeline import judge_by_photos
 
     def keep_epoch(epoch: int, adapter) -> None:
         if plan.epochs is not None:
@@ -92,9 +105,13 @@ def _train(
     with step_bar() as on_step:
         result = train_adapter(
             loaded, images, plan, seed=model.seed, compute=model.compute(), resume_in=folder, on_step=on_step,
-            on_epoch=keep_epoch,
+            on_epoch=keep_epoch, keep_after=() if guard == "off" else SHARES,
         )  # fmt: skip
+    if guard != "off" and result.trouble is None:
+        judge_by_photos(loaded, result, scenes, compute=model.compute(), select=guard == "select")
     result.save(folder)
+    if result.trouble:
+        raise FreeGeoError(f"{folder}: {result.trouble} The adapter is there to be looked at; do not use it.")
     if published:
         export_published(result.adapter, folder / "published")
     change = result.loss_change()

@@ -61,7 +61,8 @@ def demo(
         write_json(output / SCORES_NAME, score_windows(job, scene))
 
     run_job(
-        scene.photos, model, target, command="demo", recipe=recipe, extra_settings=extra, after=add_scores
+        scene.photos, model, target, command="demo", recipe=recipe, guard="report", extra_settings=extra,
+        after=add_scores,
     )  # fmt: skip
     report(read_json(output / SCORES_NAME), domain)
 

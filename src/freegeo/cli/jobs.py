@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from freegeo.cli import console
 from freegeo.cli.files import FileOptions, require_complete
-from freegeo.cli.options import ModelOptions, OutputOptions, RecipeOptions
+from freegeo.cli.options import Guard, ModelOptions, OutputOptions, RecipeOptions
 from freegeo.export import reconstruction as npz
 from freegeo.export.base import KEPT_NAME
 from freegeo.export.formats import FORMATS
@@ -37,7 +37,7 @@ LABELS = {
         name: f"--{name}"
         for name in (
             "model", "precision", "seed", "reference", "adapter", "steps", "epochs", "lr", "rank", "hold", "views",
-            "keep", "room", "domain", "published",
+            "keep", "room", "domain", "published", "guard",
         )
     },
 }  # fmt: skip
@@ -73,6 +73,7 @@ def run_job(
     adapter: Path | None = None,
     mixed: Mixed = MIXED,
     files: FileOptions = DEFAULT_FILES,
+    guard: Guard = "select",
     extra_settings: dict[str, Any] | None = None,
     after: Callable[[Job], None] = lambda job: None,
 ) -> None:
@@ -97,6 +98,7 @@ def run_job(
     adaptation = {
         "photos": list(batch.names), "photo_contents": batch.digest(), **model_options.identity(plan),
         "recipe": None if plan is None else asdict(plan),
+        "guard": None if plan is None else guard,
         "adapter": None if adapter is None else adapter_identity(adapter),
     }  # fmt: skip
     settings = {
@@ -118,7 +120,7 @@ def run_job(
             load=model_options.load, spec=empty.spec, batch=batch, folder=folder, recipe=plan, adapter=adapter,
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), warnings=console.warned(), after=after, formats=formats, photos=photos,
-            filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity(),
+            filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity(), guard=guard,
             scene=None if plan is None else lambda model: scene_images("photos", photos, model, plan, batch),
         )  # fmt: skip
         summary = job.run()
@@ -149,6 +151,8 @@ def say_finished(folder: Path, finished_at: str | None) -> None:
 def describe(summary: dict[str, Any], folder: Path) -> None:
     """Print the outcome of a job."""
     console.say(f"{len(summary['images'])} views at {summary['image_hw'][1]} x {summary['image_hw'][0]} pixels")
+    if summary["verdict"]:
+        console.say(summary["verdict"]["reason"])
     if summary["loss"]:
         first, last = summary["loss"]["first"], summary["loss"]["last"]
         console.say(f"adaptation loss {first:.4f} -> {last:.4f} (means of the first and last tenth of the steps)")

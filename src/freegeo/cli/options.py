@@ -18,6 +18,8 @@ from freegeo.errors import UserError
 from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL, entry, warn_of_embedded_model
 from freegeo.models.spec import MIXED, Mixed
 
+Guard = Literal["select", "report", "off"]
+"""What the matches between the photos decide about an adapter (`freegeo.guarded`)."""
 SMALL_MODEL = 20_000_000
 """Parameters below which a model runs on one CPU thread."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from freegeo.cli.files import FileOptions
 from freegeo.cli.jobs import DEFAULT_FILES, run_job
-from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
+from freegeo.cli.options import Guard, ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source
 
 DEFAULT_RECIPE, DEFAULT_MODEL, DEFAULT_PHOTOS = RecipeOptions(), ModelOptions(), PhotoOptions()
@@ -18,6 +18,7 @@ def run(
     photos: PhotoOptions = DEFAULT_PHOTOS,
     files: FileOptions = DEFAULT_FILES,
     adapt: bool = True,
+    guard: Guard = "select",
 ) -> None:
     """Reconstruct photos with a model adapted to them.
 
@@ -29,8 +30,11 @@ def run(
         A folder of photos, a glob in quotes, photo files, a video, or `demo` (a generated room).
     adapt
         Adapt before reconstructing; --no-adapt uses the frozen model.
+    guard
+        select: matches between the photos decide whether and in which state the adapter is used; report: they are only
+        asked; off.
     """
     found = load_source(sources, photos)
     model.warn_of_embedded(sources)
     plan = recipe if adapt else None
-    run_job(found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files)
+    run_job(found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files, guard=guard)

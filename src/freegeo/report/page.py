@@ -67,6 +67,7 @@ def render(result: Result) -> str:
     return environment.get_template(TEMPLATE).render(
         title=result.folder.resolve().name,
         facts=facts(result),
+        verdict=verdict_table(result.summary.get("verdict")),
         warnings=list(result.summary.get("warnings") or []),
         stages=[{"key": s.key, "label": s.label} for s in result.stages.values()],
         predictions=[{"key": s.key, "label": s.label} for s in result.predictions],
@@ -223,6 +224,31 @@ def score_table(scores: Mapping[str, Any]) -> dict[str, Any] | None:
     except (StopIteration, KeyError, IndexError, TypeError, AttributeError):
         return None
     return {"header": ("views", "model", *(SCORE_LABELS[key] for key in keys)), "rows": rows}
+
+
+def verdict_table(verdict: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """The guard's verdict: its sentence, and rows for the frozen model, the whole adapter and the chosen state."""
+    if not verdict:
+        return None
+    trials, chosen = verdict["trials"], verdict["chosen"]
+    rows = [("frozen", *_scores(verdict["frozen"]), "")] if trials else []
+    for number, trial in enumerate(trials):
+        whole = trial["steps"] == trial["strength"] == 1
+        if whole or number == chosen:
+            label = (
+                "adapted" if whole else f"adapted, strength {trial['strength']:g}, {100 * trial['steps']:g} % of steps"
+            )
+            used = f"{label} (used)" if number == chosen else label
+            rows.append((used, *_scores(trial), f"{100 * trial['probability']:.0f} %"))
+    return {"outcome": verdict["outcome"], "reason": verdict["reason"], "pairs": verdict["pairs"], "rows": rows}
+
+
+def _scores(numbers: Mapping[str, float | None]) -> tuple[str, ...]:
+    formats = (
+        ("epipolar_px", "{:.2f} px"), ("reprojection_px", "{:.2f} px"), ("depth_agreement", "{:.1%}"),
+        ("scale_drift", "{:.1%}"),
+    )  # fmt: skip
+    return tuple("–" if numbers[name] is None else text.format(numbers[name]) for name, text in formats)
 
 
 def filter_tables(result: Result) -> list[dict[str, Any]]:

@@ -1,0 +1,363 @@
+"""Did an adaptation help this scene? The verdict of the photos' matches, and the adapter state that it allows.
+
+The frozen model's prediction and those of some states of the adapter (steps, strength) are compared by scores of the
+same matches, pair by pair. An adapted state is taken only where the evidence for it is strong, and no sign of harm that
+matches do not see speaks against it; else the frozen model stays. The rule, what it is worth and what it misses:
+docs/guard.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from freegeo.evidence.candidate import Candidate
+from freegeo.evidence.dense import CoVisible, co_visible, depth_agreement
+from freegeo.evidence.matches import Matches
+from freegeo.evidence.scores import PairScores, depth_scale, epipolar, off_edges, reprojection
+
+__all__ = ["GuardSettings", "Measurement", "Reference", "State", "Trial", "Verdict", "judge", "states", "try_states"]
+
+STRENGTHS = (1.0, 0.75, 0.5, 0.25)
+SHARES = (0.25, 0.5, 0.75)
+"""Shares of the steps after which the adapter's state is kept, besides the last step."""
+_FLOOR_S1, _FLOOR_S2 = 0.05, 0.1
+"""Matching pixels below which errors say nothing, added before the logarithm."""
+
+Outcome = Literal["adapted", "frozen", "unknown"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GuardSettings:
+    """How strong the evidence for an adapted state must be."""
+
+    probability: float = 0.9
+    """Least probability, by bootstrap over pairs, that the state is better than the frozen model."""
+    pairs: int = 6
+    """Fewest pairs of views with scores."""
+    views: float = 0.75
+    """Least share of the views that these pairs cover."""
+    depth_loss: float = 0.01
+    """Largest allowed loss of the share of pixels whose depth other views confirm."""
+    drift: float = 0.01
+    """Largest allowed growth of the disagreement in scale between depth and camera positions."""
+    draws: int = 200
+    """Bootstrap draws."""
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True, order=True)
+class State:
+    """A state of an adapter: after a share of the training steps, applied with a strength."""
+
+    steps: float
+    """Share of the steps, above 0 to 1."""
+    strength: float
+    """0 is the frozen model, 1 the adapter as it was trained."""
+
+    def __str__(self) -> str:
+        """Return a phrase such as "strength 0.5 after 75 % of the steps"."""
+        after = "all" if self.steps == 1 else f"{100 * self.steps:g} %"
+        return f"strength {self.strength:g} after {after} of the steps"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measurement:
+    """The scores of one prediction."""
+
+    epipolar: PairScores
+    """Cameras against matches."""
+    reprojection: PairScores
+    """Cameras and depth against matches."""
+    drift: float
+    """Distance from 1 of the factor between the scales of depth and of camera positions; nan without evidence."""
+    agreement: float
+    """Share of pixels whose depth the other views confirm (`compared_agreement`)."""
+    agreement_before: float
+    """The same of the frozen prediction, on the same pixels."""
+
+    @property
+    def epipolar_px(self) -> float:
+        """Median over the pairs of their epipolar error, matching pixels; nan without evidence."""
+        return _median(self.epipolar.values)
+
+    @property
+    def reprojection_px(self) -> float:
+        """Median over the pairs of their reprojection error, matching pixels; nan without evidence."""
+        return _median(self.reprojection.values)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trial:
+    """One state of the adapter, compared with the frozen model."""
+
+    state: State
+    measured: Measurement
+    gain: float
+    """Mean over pairs of the fall of log(S1 + .05) + log(S2 + .1): above 0 is better; nan without a common pair."""
+    spread: float
+    """Standard error of the gain."""
+    probability: float
+    """Share of bootstrap draws of the pairs in which the gain is above 0; 0 without evidence."""
+    veto: str | None
+    """Why the state is refused whatever the gain; None: it is not."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Verdict:
+    """What the evidence says about an adaptation."""
+
+    outcome: Outcome
+    """`adapted`: a state of the adapter is better; `frozen`: none is for certain; `unknown`: too few matches."""
+    reason: str
+    """The verdict in one sentence."""
+    frozen: Measurement
+    trials: Sequence[Trial] = field(default_factory=tuple)
+    chosen: Trial | None = None
+    """The trial to use; None: the frozen model."""
+    pairs: int = 0
+    """Pairs of views that had a say."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the verdict as JSON-like values; what is unknown is None."""
+        return {
+            "outcome": self.outcome,
+            "reason": self.reason,
+            "pairs": self.pairs,
+            "frozen": _numbers(self.frozen),
+            "trials": [
+                {
+                    "steps": trial.state.steps, "strength": trial.state.strength, **_numbers(trial.measured),
+                    "gain": _number(trial.gain), "probability": trial.probability, "veto": trial.veto,
+                }
+                for trial in self.trials
+            ],
+            "chosen": None if self.chosen is None else list(self.trials).index(self.chosen),
+        }  # fmt: skip
+
+    @property
+    def best(self) -> Trial | None:
+        """The chosen trial, or else the one with the greatest gain: what adaptation amounts to on this scene."""
+        known = [trial for trial in self.trials if not np.isnan(trial.gain)]
+        return self.chosen or max(known, key=lambda trial: trial.gain, default=None)
+
+
+def states() -> list[State]:
+    """Return the states that are tried: the last step with every strength, and earlier steps with full strength."""
+    return [
+        *(State(steps=1.0, strength=strength) for strength in STRENGTHS),
+        *(State(steps=share, strength=1.0) for share in SHARES),
+    ]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reference:
+    """The frozen prediction that others are compared with, and what is computed of it once."""
+
+    candidate: Candidate
+    matches: Matches
+    keep: np.ndarray
+    """(M, 2) bool, match ends whose depth counts, the same for all predictions."""
+    common: CoVisible
+    """Pixels that several views see by the frozen prediction."""
+
+    @classmethod
+    def of(cls, frozen: Candidate, matches: Matches) -> Reference:
+        """Prepare a frozen prediction."""
+        return cls(candidate=frozen, matches=matches, keep=off_edges(frozen, matches), common=co_visible(frozen))
+
+    def measure(self, candidate: Candidate) -> Measurement:
+        """Score a prediction of the same photos."""
+        agreement, before = self.compared_agreement(candidate)
+        return Measurement(
+            epipolar=epipolar(candidate, self.matches),
+            reprojection=reprojection(candidate, self.matches, keep=self.keep),
+            drift=depth_scale(candidate, self.matches, keep=self.keep).drift,
+            agreement=agreement,
+            agreement_before=before,
+        )
+
+    def compared_agreement(self, candidate: Candidate) -> tuple[float, float]:
+        """Shares of pixels whose depth other views confirm: of a prediction, and of the frozen one.
+
+        Each is the mean over two sets of pixels, those that several views see by the one and by the other prediction.
+        On one set alone the prediction that chose it would have the advantage: its surfaces are not hidden there.
+        """
+        own = co_visible(candidate)
+        tolerance = min(own.tolerance, self.common.tolerance)
+        sets = [replace(pixels, tolerance=tolerance) for pixels in (self.common, own)]
+        after, before = (
+            sum(depth_agreement(one, pixels).mean_share for pixels in sets) / 2 for one in (candidate, self.candidate)
+        )
+        return after, before
+
+
+def try_states(
+    predict: Callable[[State], Sequence[Candidate] | None],
+    references: Sequence[Reference],
+    *,
+    settings: GuardSettings | None = None,
+) -> Verdict:
+    """Predict with the states of an adapter (`states`), and judge them; without enough matches nothing is predicted.
+
+    Args:
+        predict: predictions of all photos of every scene with the adapter in a state; None when they are no finite
+            numbers, which leaves the state out.
+        references: the frozen predictions of the scenes. Their pairs are judged together.
+        settings: None: the defaults.
+    """
+    settings = settings or GuardSettings()
+    base = _together([reference.measure(reference.candidate) for reference in references])
+    missing = too_little(base, [reference.matches for reference in references], settings)
+    if missing:
+        return Verdict(outcome="unknown", reason=missing, frozen=base)
+    found = []
+    for state in states():
+        candidates = predict(state)
+        if candidates is not None:
+            parts = zip(references, candidates, strict=True)
+            found.append((state, _together([reference.measure(candidate) for reference, candidate in parts])))
+    return judge(base, found, settings)
+
+
+def _together(measured: Sequence[Measurement]) -> Measurement:
+    """Scores of several scenes as one: pairs side by side (views counted on), other numbers as means."""
+    if len(measured) == 1:
+        return measured[0]
+    return Measurement(
+        epipolar=_side_by_side([one.epipolar for one in measured]),
+        reprojection=_side_by_side([one.reprojection for one in measured]),
+        drift=float(np.mean([one.drift for one in measured])),
+        agreement=float(np.mean([one.agreement for one in measured])),
+        agreement_before=float(np.mean([one.agreement_before for one in measured])),
+    )
+
+
+def _side_by_side(scores: Sequence[PairScores]) -> PairScores:
+    # Views of different scenes are different views.
+    apart = 1 + max((int(one.pairs.max()) for one in scores if one.pairs.size), default=0)
+    return PairScores(
+        pairs=np.concatenate([one.pairs + k * apart for k, one in enumerate(scores)]),
+        values=np.concatenate([one.values for one in scores]),
+        used=np.concatenate([one.used for one in scores]),
+        reason=None if any(one.reason is None for one in scores) else scores[0].reason,
+    )
+
+
+def judge(frozen: Measurement, found: Sequence[tuple[State, Measurement]], settings: GuardSettings) -> Verdict:
+    """Compare the scores of adapter states with those of the frozen model, and choose."""
+    trials = [_trial(state, measured, frozen, settings) for state, measured in found]
+    usable = [t for t in trials if t.veto is None and t.probability >= settings.probability]
+    pairs = int(_known(frozen).sum())
+    if not usable:
+        return Verdict(
+            outcome="frozen", reason=_why_not(trials, pairs), frozen=frozen, trials=tuple(trials), pairs=pairs
+        )
+    best = max(usable, key=lambda trial: trial.gain)
+    # Within the noise of the best the least change is the safest.
+    near = [trial for trial in usable if trial.gain >= best.gain - best.spread]
+    chosen = min(near, key=lambda trial: (trial.state.strength, trial.state.steps))
+    reason = (
+        f"Adaptation helped by the matches between the photos: {_changes(frozen, chosen.measured)} over {pairs} pairs "
+        f"({100 * chosen.probability:.0f} % sure); used with {chosen.state}."
+    )
+    return Verdict(outcome="adapted", reason=reason, frozen=frozen, trials=tuple(trials), chosen=chosen, pairs=pairs)
+
+
+def too_little(frozen: Measurement, matches: Sequence[Matches], settings: GuardSettings) -> str | None:
+    """Return why the matches of scenes cannot judge, in one sentence; None when they can."""
+    reasons = [one.reason() for one in matches]
+    reason = reasons[0]
+    if reason and all(reasons):
+        return f"Not enough matches to judge: {reason[0].lower()}{reason[1:]}"
+    known = _known(frozen)
+    covered = len(np.unique(frozen.epipolar.pairs[known]))
+    if known.sum() < settings.pairs:
+        return (
+            f"Not enough matches to judge: {known.sum()} pairs of photos have some, {settings.pairs} are needed. "
+            "Photos that overlap more, or are sharper and brighter, have more."
+        )
+    photos = sum(len(one) for one in matches)
+    if covered < settings.views * photos:
+        return (
+            f"Not enough matches to judge: they cover {covered} of {photos} photos. Leave out photos that "
+            "overlap with no other, or add some between."
+        )
+    return None
+
+
+def _known(measured: Measurement) -> np.ndarray:
+    """Pairs (P,) with both scores."""
+    return np.isfinite(measured.epipolar.values) & np.isfinite(measured.reprojection.values)
+
+
+def _objective(measured: Measurement) -> np.ndarray:
+    """J of every pair (P,), lower is better; nan without evidence, inf where every point is behind a camera."""
+    return np.log(measured.epipolar.values + _FLOOR_S1) + np.log(measured.reprojection.values + _FLOOR_S2)
+
+
+def _trial(state: State, measured: Measurement, frozen: Measurement, settings: GuardSettings) -> Trial:
+    known = _known(frozen)
+    fall = (_objective(frozen) - _objective(measured))[known]
+    veto = _veto(measured, frozen, fall, settings)
+    gain = spread = float("nan")
+    probability = 0.0
+    if np.isfinite(fall).all():
+        draws = np.random.default_rng(settings.seed).integers(0, len(fall), (settings.draws, len(fall)))
+        means = fall[draws].mean(axis=1)
+        gain, spread, probability = float(fall.mean()), float(means.std()), float((means > 0).mean())
+    return Trial(state=state, measured=measured, gain=gain, spread=spread, probability=probability, veto=veto)
+
+
+def _veto(measured: Measurement, frozen: Measurement, fall: np.ndarray, settings: GuardSettings) -> str | None:
+    if not np.isfinite(fall).all():
+        return "points that both photos see lie behind a camera"
+    before, after = measured.agreement_before, measured.agreement
+    if before - after > settings.depth_loss:
+        return f"depth maps agree less ({100 * before:.1f} % -> {100 * after:.1f} % of the pixels)"
+    if measured.drift - frozen.drift > settings.drift:
+        return f"depth and camera positions drift apart in scale ({frozen.drift:.1%} -> {measured.drift:.1%})"
+    return None
+
+
+def _why_not(trials: Sequence[Trial], pairs: int) -> str:
+    if not trials:
+        return "Adaptation is not used because its predictions are no finite numbers; the frozen model is."
+    vetoed = [trial for trial in trials if trial.veto is not None and trial.probability > 0]
+    if all(trial.gain < 0 for trial in trials):
+        return f"Adaptation made the matches between the photos fit worse over {pairs} pairs; the frozen model is used."
+    if len(vetoed) == len(trials) and vetoed:
+        return f"Adaptation is not used because {vetoed[0].veto}; the frozen model is."
+    best = max((trial.probability for trial in trials), default=0.0)
+    return (
+        f"The matches between the photos do not prove that adaptation helped ({100 * best:.0f} % sure over {pairs} "
+        "pairs); the frozen model is used."
+    )
+
+
+def _changes(before: Measurement, after: Measurement) -> str:
+    return (
+        f"epipolar error {before.epipolar_px:.2f} -> {after.epipolar_px:.2f} px, reprojection error "
+        f"{before.reprojection_px:.2f} -> {after.reprojection_px:.2f} px"
+    )
+
+
+def _numbers(measured: Measurement) -> dict[str, float | None]:
+    return {
+        "epipolar_px": _number(measured.epipolar_px),
+        "reprojection_px": _number(measured.reprojection_px),
+        "scale_drift": _number(measured.drift),
+        "depth_agreement": _number(measured.agreement),
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _median(values: np.ndarray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
