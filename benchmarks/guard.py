@@ -24,9 +24,18 @@ from freegeo.adaptation.samples import SceneImages
 from freegeo.data.procedural import get_domain, photograph_room
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.dense import depth_agreement
-from freegeo.evidence.guard import SHARES, STRENGTHS, Reference
+from freegeo.evidence.guard import (
+    SHARES,
+    STRENGTHS,
+    GuardSettings,
+    Measurement,
+    Reference,
+    State,
+    Verdict,
+    judge,
+)  # fmt: skip
 from freegeo.evidence.matches import find_matches
-from freegeo.evidence.scores import two_view
+from freegeo.evidence.scores import PairScores, two_view
 from freegeo.metrics.scene import evaluate
 from freegeo.models.catalog import load_model
 from freegeo.models.precision import Compute
@@ -112,6 +121,95 @@ def trained(model) -> dict[str, torch.Tensor]:
     }
 
 
+class Room:
+    """One recorded room."""
+
+    def __init__(self, file: Path):
+        with np.load(file) as content:
+            self.arrays = dict(content)
+        self.domain = file.name.rsplit("-", 3)[0]
+
+    def gain(self, candidate: tuple[float, float], name: str, metric: str) -> float:
+        """Change of a metric against the frozen model; above 0 is better for all but abs_rel."""
+        column = METRICS.index(metric)
+        return float(self.arrays[f"{_key(candidate)}/{name}"][column] - self.arrays[f"{_key(FROZEN)}/{name}"][column])
+
+    def measured(self, candidate: tuple[float, float]) -> Measurement:
+        """The recorded scores."""
+        pairs, key = self.arrays["pairs"], _key(candidate)
+        s1, s2 = (
+            PairScores(pairs=pairs, values=self.arrays[f"{key}/{name}"], used=self.arrays["counts"], reason=None)
+            for name in ("s1", "s2")
+        )
+        after, before = self.arrays[f"{key}/s3"]
+        return Measurement(
+            epipolar=s1, reprojection=s2, drift=float(self.arrays[f"{key}/s2g"]), agreement=float(after),
+            agreement_before=float(before),
+        )  # fmt: skip
+
+    def verdict(self, settings: GuardSettings) -> Verdict:
+        """What the guard would have said."""
+        base = self.measured(FROZEN)
+        known = np.isfinite(base.epipolar.values) & np.isfinite(base.reprojection.values)
+        covered = len(np.unique(base.epipolar.pairs[known]))
+        if known.sum() < settings.pairs or covered < settings.views * len(ADAPTED_TO):
+            return Verdict(outcome="unknown", reason="", frozen=base)
+        found = [(State(steps=share, strength=s), self.measured((share, s))) for share, s in CANDIDATES[1:]]
+        return judge(base, found, settings)
+
+
+def _key(candidate: tuple[float, float]) -> str:
+    return f"{candidate[0]:g}-{candidate[1]:g}"
+
+
+def report(folder: Path) -> None:
+    """Print the tables of docs/guard.md."""
+    rooms = [Room(file) for file in sorted(folder.glob("*.npz"))]
+    settings = GuardSettings()
+    groups = {domain: [room for room in rooms if room.domain == domain] for domain in sorted({r.domain for r in rooms})}
+    for domain, group in {**groups, "all": rooms}.items():
+        verdicts = [room.verdict(settings) for room in group]
+        chosen = [FROZEN if v.chosen is None else (v.chosen.state.steps, v.chosen.state.strength) for v in verdicts]
+        said = [sum(v.outcome == outcome for v in verdicts) for outcome in ("adapted", "frozen", "unknown")]
+        print(f"\n{domain}: {len(group)} rooms; verdict adapted {said[0]}, frozen {said[1]}, unknown {said[2]}")
+        for name in SETS:
+            for metric in ("auc15", "auc30", "f1_rel5"):
+                always = np.array([room.gain((1.0, 1.0), name, metric) for room in group])
+                guarded = np.array([room.gain(state, name, metric) for room, state in zip(group, chosen, strict=True)])
+                oracle = np.array([max(room.gain(c, name, metric) for c in CANDIDATES) for room in group])
+                print(
+                    f"  {name:9s} {metric:8s} always {_summary(always)}  guard {_summary(guarded)}"
+                    f"  oracle {oracle.mean():+.3f}"
+                )
+    for score in ("s1", "s2", "s3", "s3-fixed", "s1b"):
+        print(score, " ".join(f"{name} {metric} {_rank(rooms, score, name, metric):+.2f}"
+              for name in ("seen-4", "seen-12", "all-16") for metric in ("auc30", "f1_rel5")))  # fmt: skip
+
+
+def _summary(gains: np.ndarray) -> str:
+    return f"{gains.mean():+.3f} (worst {gains.min():+.3f})"
+
+
+def _rank(rooms: list[Room], score: str, name: str, metric: str) -> float:
+    """Spearman correlation of a score's gain with the true gain, over rooms and candidates."""
+    from scipy.stats import spearmanr
+
+    true, told = [], []
+    for room in rooms:
+        for candidate in CANDIDATES[1:]:
+            before, after = (np.asarray(room.arrays[f"{_key(c)}/{score}"], float) for c in (FROZEN, candidate))
+            if score in ("s1", "s2"):
+                change = np.nanmean(np.log(before + 0.05) - np.log(after + 0.05)) if len(before) else np.nan
+            elif score == "s1b":
+                change = np.nanmean(before - after)
+            else:
+                change = after[0] - (after[1] if score == "s3" else before[0])
+            if np.isfinite(change):
+                true.append(room.gain(candidate, name, metric))
+                told.append(change)
+    return float(spearmanr(true, told).statistic)
+
+
 def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -123,7 +221,12 @@ def main() -> None:
     recording.add_argument("--start", type=int, default=0)
     recording.add_argument("--hold", type=float, default=1.0)
     recording.add_argument("--seed", type=int, default=43)
+    reporting = commands.add_parser("report")
+    reporting.add_argument("folder", type=Path)
     options = parser.parse_args()
+    if options.command == "report":
+        report(options.folder)
+        return
     torch.set_num_threads(1)
     for room in range(options.start, options.start + options.rooms):
         for domain in options.domains:

@@ -10,8 +10,10 @@ PACKAGE = Path(__file__).parents[1] / "src" / "freegeo"
 ANYWHERE = {"types", "errors", "files", "run_folder", "__init__"}
 ALLOWED = {
     "pipeline": {
-        *("models", "data", "adaptation", "evidence", "fusion", "export", "report", "metrics", "geometry", "progress")
+        *("models", "data", "adaptation", "evidence", "fusion", "export", "report", "metrics", "geometry", "progress"),
+        "guarded",
     },
+    "guarded": {"adaptation", "evidence", "export"},
     "progress": {"adaptation"},
     "benchmark": {"adaptation", "models", "data", "fusion", "metrics", "geometry"},
     "training": {"models", "data", "metrics", "geometry"},

@@ -45,7 +45,9 @@ def test_program_of_the_readme_runs(photo_folder, capsys):
     assert {path.name for path in (photo_folder / "out").iterdir() if not path.name.startswith(".")} == {
         "prediction.npz", "points.ply", "scene.glb",
     }  # fmt: skip
-    assert not np.array_equal(names["before"].depth_z, names["after"].depth_z)
+    # Photos of 64 x 48 pixels have too few matches to judge an adaptation by.
+    assert names["result"].verdict["outcome"] == "unknown"
+    assert np.array_equal(names["before"].depth_z, names["after"].depth_z)
     assert (photo_folder / "adapter" / "freegeo.json").is_file()
 
 

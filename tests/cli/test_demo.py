@@ -27,7 +27,7 @@ def finished(tmp_path_factory, tiny, short_path):
     """Folder of a demo that ran to its end, and what it printed."""
     out, printed = tmp_path_factory.mktemp("demo") / "out", io.StringIO()
     with redirect_stdout(printed):
-        assert main(["demo", "-o", str(out), "--checkpoint", tiny[3], *QUICK]) == 0
+        assert main(["demo", "-o", str(out), "--checkpoint", tiny[3], *QUICK[:4]]) == 0
     return out, printed.getvalue()
 
 
@@ -52,17 +52,17 @@ def test_demo_scores_both_models_and_points_to_the_files(finished):
 
 def test_finished_demo_shows_its_table_again(freegeo, tiny, finished):
     out, _ = finished
-    outcome = freegeo("demo", "-o", out, "--checkpoint", tiny[3], *QUICK)
+    outcome = freegeo("demo", "-o", out, "--checkpoint", tiny[3], *QUICK[:4])
     assert outcome.code == 0
     assert "already finished" in outcome.out
     assert "8 views: adaptation" in outcome.out
-    other = freegeo("demo", "-o", out, "--checkpoint", tiny[3], *QUICK, "--room", 1)
+    other = freegeo("demo", "-o", out, "--checkpoint", tiny[3], *QUICK[:4], "--room", 1)
     assert other.code == 2
     assert "room: 0 there, 1 now" in other.sentence()
 
 
 def test_demo_that_was_stopped_while_scoring_is_not_finished(freegeo, tiny, tmp_path, monkeypatch):
-    arguments = ["demo", "-o", tmp_path, "--checkpoint", tiny[3], *QUICK]
+    arguments = ["demo", "-o", tmp_path, "--checkpoint", tiny[3], *QUICK[:4]]
     with monkeypatch.context() as patch:
         patch.setattr(demo, "score_windows", lambda job, scene: (_ for _ in ()).throw(KeyboardInterrupt))
         assert freegeo(*arguments).code == 130

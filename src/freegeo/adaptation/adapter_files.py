@@ -52,21 +52,23 @@ LORA_SUFFIX, TOKEN_SUFFIX = "_lora_peft", "_lora.pt"
 
 
 def save_adapter(adapter: Adapter, folder: Path, metadata: Mapping[str, Any]) -> list[Path]:
-    """Write an adapter at strength 1; `metadata` is what freegeo.json adds to the base model's identity.
+    """Write an adapter; `metadata` is what freegeo.json adds to the base model's identity and the adapter's strength.
 
-    Returns the files.
+    Returns the files. The tensors are those of strength 1.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = write_peft(adapter, folder)
     if adapter.camera_token is not None:
         write_tensors(folder / TOKEN, {"camera_token": adapter.camera_token.float()})
         files.append(folder / TOKEN)
-    write_json(folder / METADATA, {"format": FORMAT, "base": _base(adapter.model), **metadata})
+    write_json(
+        folder / METADATA, {"format": FORMAT, "base": _base(adapter.model), "strength": adapter.strength, **metadata}
+    )
     return [*files, folder / METADATA]
 
 
 def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
-    """Attach a saved adapter, on and at strength 1, for inference; the model is unchanged when this fails.
+    """Attach a saved adapter, on and at its stored strength, for inference; the model is unchanged when this fails.
 
     Reads our own folders, plain peft folders and the authors' published layout (`find_adapter` says where). UserError
     when the folder is no adapter, when its numbers are not finite, or when it was made for another model (by layer
@@ -74,7 +76,8 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
     """
     folder, model = find_adapter(folder), model.adaptable()
     config, tensors = read_peft(folder)
-    _require_same_base(model, adapter_metadata(folder), folder)
+    metadata = adapter_metadata(folder)
+    _require_same_base(model, metadata, folder)
     tensors = own_names(model, tensors) | _camera_token(model, folder)
     adapter = Adapter.attach(
         model,
@@ -98,6 +101,7 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
         raise
     for parameter in adapter.parameters():
         parameter.requires_grad_(False)
+    adapter.set_strength(float((metadata or {}).get("strength", 1)))
     return adapter
 
 
