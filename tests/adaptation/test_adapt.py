@@ -271,7 +271,7 @@ def test_fewer_than_three_views_are_refused_and_leave_the_model_plain():
     ],
 )
 def test_what_is_done_instead_with_few_photos_is_said(views, changes, words, caplog):
-    caplog.set_level("INFO")
+    caplog.set_level("INFO", logger="freegeo")
     model = tiny_da3()
     run(model, [noise_scene(views)], quick(model, steps=1, **changes))
     assert words in caplog.text
@@ -559,7 +559,7 @@ def last_block(model):
 @pytest.mark.parametrize("at", [2, 4])
 def test_a_signal_during_a_step_saves_the_state_of_the_step_before(build, at, stopping, tmp_path, caplog):
     number, error = stopping
-    caplog.set_level("INFO")
+    caplog.set_level("INFO", logger="freegeo")
     scenes, model = [noise_scene(9), noise_scene(4, seed=1)], build()
     recipe = quick(model, steps=5, dropout=0.1)
     Stopper(last_block(model), at, number)

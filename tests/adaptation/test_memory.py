@@ -209,7 +209,7 @@ def test_the_disk_is_looked_at_where_the_files_will_be(tmp_path, monkeypatch):
 
 def test_the_plan_is_said_in_one_line_and_its_parts_to_those_who_ask(caplog, monkeypatch):
     monkeypatch.setattr(memory.shutil, "disk_usage", lambda path: SimpleNamespace(free=100 * GB))
-    caplog.set_level("DEBUG")
+    caplog.set_level("DEBUG", logger="freegeo")
     plan = eth3d(14.7)
     said, parts = caplog.messages
     assert said == (

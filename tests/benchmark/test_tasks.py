@@ -228,7 +228,7 @@ def test_an_adapter_that_should_not_be_used_is_said_in_every_run_and_scored_all_
     broken = replace(setup, changes={"steps": 1, "batch": 1, "lr": 100.0})
     assert predict_all(Predictor(broken), [task("adapted")]) == []
     sentence = f"the adapter for {DATASET} "
-    assert [sentence in text and "worse at its own task" in text for text in caplog.messages] == [True]
+    assert ["worse at its own task" in text for text in caplog.messages if sentence in text] == [True]
     caplog.clear()
     predictor = Predictor(broken)
     [job] = predictor.adapter_jobs([task("adapted")])
