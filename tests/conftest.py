@@ -1,6 +1,7 @@
 """Settings of all tests."""
 
 import ipaddress
+import logging
 import sys
 
 import pytest
@@ -34,6 +35,16 @@ def forbid_network(event: str, arguments: tuple) -> None:
 
 # A hook, not a patched socket module: it also sees what compiled code does through Python, and no test can undo it.
 sys.addaudithook(forbid_network)
+
+
+@pytest.fixture(autouse=True)
+def fresh_log():
+    """Give the package's logger back as it was: the commands set its level and handlers for their process."""
+    logger = logging.getLogger("freegeo")
+    before = logger.level, list(logger.handlers), logger.propagate
+    yield
+    logger.setLevel(before[0])
+    logger.handlers[:], logger.propagate = before[1:]
 
 
 @pytest.fixture

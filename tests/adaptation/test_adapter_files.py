@@ -74,7 +74,8 @@ def test_the_page_says_what_the_adapter_is(build, tmp_path):
     files = save_adapter(attach(model), tmp_path, METADATA)
     metadata = adapter_metadata(tmp_path)
     assert metadata == {
-        "format": 1, "base": {"model": model.spec.name, "fingerprint": "0123", "licence": "none"}, **METADATA
+        "format": 1, "base": {"model": model.spec.name, "fingerprint": "0123", "licence": "none"},
+        "strength": 1.0, **METADATA,
     }  # fmt: skip
     assert sorted(tmp_path.iterdir()) == sorted(files)
     config = json.loads((tmp_path / "adapter_config.json").read_text())

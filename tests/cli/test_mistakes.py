@@ -257,7 +257,7 @@ def test_adapters_that_cannot_be_used(freegeo, photo_folder, tiny, tmp_path, kin
 # -- failures
 
 
-def test_loss_that_is_not_finite_names_its_term_and_spares_the_adapter(
+def test_loss_that_is_not_finite_names_its_term_and_leaves_the_frozen_result(
     freegeo, photo_folder, tiny, tmp_path, monkeypatch
 ):
     plain = adapting.adaptation_loss
@@ -274,12 +274,31 @@ def test_loss_that_is_not_finite_names_its_term_and_spares_the_adapter(
 
     monkeypatch.setattr(adapting, "adaptation_loss", poisoned)
     monkeypatch.setattr(torch.optim, "AdamW", Optimiser)
-    outcome = freegeo("run", photo_folder, "-o", tmp_path / "out", *tiny, *QUICK)
-    assert outcome.code == 1
-    assert "is not finite at step 0" in outcome.sentence()
-    assert "adaptation diverged: loss term " in outcome.sentence()
+    out = tmp_path / "out"
+    outcome = freegeo("run", photo_folder, "-o", out, *tiny, *QUICK)
+    assert outcome.code == 0
     assert adapters == []
-    assert not (tmp_path / "out" / "prediction.npz").exists()
+    summary = json.loads((out / "reconstruction.json").read_text())
+    (warning,) = [sentence for sentence in summary["warnings"] if "diverged" in sentence]
+    assert warning.startswith("Adaptation diverged: loss term ") and "is not finite at step 0" in warning
+    assert warning.endswith("The result is that of the frozen model.")
+    for text in (outcome.err, outcome.out, (out / "report.html").read_text()):
+        assert warning in text
+    assert summary["adapter"] is None
+    assert (out / "prediction.npz").read_bytes() == (out / "frozen" / "prediction.npz").read_bytes()
+    # The same command does not train again, other formats neither.
+    poisoned_calls = len(adapters)
+    assert "already finished" in freegeo("run", photo_folder, "-o", out, *tiny, *QUICK).out
+    assert freegeo("run", photo_folder, "-o", out, *tiny, *QUICK, "--formats", "depth").code == 0
+    assert warning in (out / "report.html").read_text()
+    assert len(adapters) == poisoned_calls
+
+
+def test_adapting_alone_fails_when_the_adapter_is_of_no_use(freegeo, photo_folder, tiny, tmp_path):
+    out = tmp_path / "adapter"
+    outcome = freegeo("adapt", photo_folder, "-o", out, *tiny, *QUICK, "--lr", 100)
+    assert outcome.code == 1
+    assert "--lr (now 100)" in outcome.sentence()
     assert not list((tmp_path / "out").glob("**/*.part*"))
 
 

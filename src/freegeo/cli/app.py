@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 ABOUT = "Adapt feed-forward 3D models to your scene at test time."
 GLOBAL = "Every command takes --config FILE.toml (a table of options per command) and -v for more messages."
 USER_MISTAKE, FAILURE, PARTIAL, INTERRUPTED = 2, 1, 3, 130
+TERMINATED = 143
+"""Exit code after SIGTERM."""
 
 COMMANDS = {
     "demo": ("freegeo.cli.demo:demo", "Photograph a generated room, adapt to it, score before and after."),
@@ -178,6 +181,8 @@ def checked_config(path: Path) -> Path:
 
 def entry() -> None:
     """Console script: exit with the command's code."""
+    # A run that is asked to end saves its state, as after Ctrl-C.
+    signal.signal(signal.SIGTERM, lambda *arguments: sys.exit(TERMINATED))
     code = main()
     console.finish_streams()
     # Worker threads of third-party libraries must not hold the process after everything is written.
