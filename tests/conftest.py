@@ -39,12 +39,11 @@ sys.addaudithook(forbid_network)
 
 @pytest.fixture(autouse=True)
 def fresh_log():
-    """Give the package's logger back as it was: the commands set its level and handlers for their process."""
+    """Start with the package's logger as it is in a new process: the commands set its level and handlers."""
     logger = logging.getLogger("freegeo")
-    before = logger.level, list(logger.handlers), logger.propagate
-    yield
-    logger.setLevel(before[0])
-    logger.handlers[:], logger.propagate = before[1:]
+    logger.setLevel(logging.NOTSET)
+    logger.handlers.clear()
+    logger.propagate = True
 
 
 @pytest.fixture
