@@ -24,6 +24,7 @@ from freegeo.metrics.pose import pair_errors
 
 pytest.importorskip("pycolmap", reason="needs the extra colmap")
 VIEWS = 6
+NOISE_PX = 0.1
 
 
 @cache
@@ -35,7 +36,7 @@ def matched(
     scene: Reconstruction,
     *,
     noise_px: float = 0.3,
-    points: int = 250,
+    points: int = 900,
     wrong: float = 0.0,
     joined=lambda i, j: True,
     seed: int = 0,
@@ -109,7 +110,7 @@ def pose_error(T: np.ndarray, scene: Reconstruction) -> float:
 
 @cache
 def exact() -> Matches:
-    return matched(scene())
+    return matched(scene(), noise_px=NOISE_PX)
 
 
 @cache
@@ -133,8 +134,8 @@ def test_held_out_errors_fall_to_the_noise_of_the_matches():
     assert result.probability == 1.0
     assert len(result.pairs) == len(result.before_px) == len(result.after_px) >= 6
     # The Sampson distance of normal noise s is |N(0, s)|, of median 0.6745 s.
-    assert np.median(result.after_px) < 1.5 * 0.6745 * 0.3 < 0.2 * np.median(result.before_px)
-    assert np.median(result.error_px) < 0.5
+    assert np.median(result.after_px) < 1.5 * 0.6745 * NOISE_PX < 0.2 * np.median(result.before_px)
+    assert np.median(result.error_px) < 2 * NOISE_PX
     assert result.share_good > 0.95
 
 
@@ -153,8 +154,8 @@ def test_the_first_view_and_the_scale_of_the_prediction_stay():
     moved, without = bring_depth(wrong, result)
     assert without == ()
     assert np.median(moved.depth_z / wrong.depth_z) == pytest.approx(1, abs=0.01)
-    size = np.linalg.norm(centres(result.T_cam_world), axis=1) / np.linalg.norm(centres(scene().T_cam_world), axis=1)
-    assert np.median(size[1:]) == pytest.approx(1, abs=0.02)
+    size = np.linalg.norm(centres(result.T_cam_world)[1:], axis=1)
+    assert np.median(size / np.linalg.norm(centres(scene().T_cam_world)[1:], axis=1)) == pytest.approx(1, abs=0.02)
 
 
 def centres(T: np.ndarray) -> np.ndarray:
@@ -230,9 +231,10 @@ def test_focal_lengths_of_their_own_are_found():
     K = scene().K.copy()
     K[:, (0, 1), (0, 1)] *= np.linspace(0.97, 1.03, VIEWS, dtype=np.float32)[:, None]
     start, camera = shared_cameras(replace(scene(), K=K), share_focal=False)
-    found = solve(start, camera, exact(), join_matches(exact()))
+    clean = matched(scene(), noise_px=0)
+    found = solve(start, camera, clean, join_matches(clean))
     assert found is not None
-    assert found[0].candidate.K[:, 0, 0].numpy() == pytest.approx(scene().K[:, 0, 0], rel=0.01)
+    assert found[0].candidate.K[:, 0, 0].numpy() == pytest.approx(scene().K[:, 0, 0], rel=0.002)
 
 
 # What is refused.
@@ -273,7 +275,7 @@ def test_photos_from_one_place_are_refused(focal, noise_px):
 
 def test_parallax_tells_turns_from_walks():
     assert parallax_px(Candidate.of(turning()), matched(turning(), noise_px=0.3)) < 0.6
-    assert parallax_px(Candidate.of(scene()), exact()) > 3
+    assert parallax_px(Candidate.of(scene()), exact()) > 2
 
 
 def plane() -> Reconstruction:
@@ -346,7 +348,9 @@ def test_identical_photos_and_photos_without_matches_are_refused():
 
 
 def test_few_points_and_few_pairs_are_refused():
-    refused(perturbed(scene()), matched(scene(), points=25), "needed")
+    few = np.concatenate([np.arange(a, a + 3) for a in exact().pair_start[:-1]])
+    thin = replace(exact(), ends=exact().ends[few], pair_start=3 * np.arange(len(exact().pairs) + 1))
+    refused(perturbed(scene()), thin, "30 are needed")
     chain = matched(scene(), joined=lambda i, j: j - i == 1)
     refused(perturbed(scene()), chain, "5 pairs")
 

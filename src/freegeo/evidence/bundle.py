@@ -77,7 +77,8 @@ class Solution:
     """What an adjustment ended with."""
 
     candidate: Candidate
-    """All S cameras; those that are not refined follow the nearest one that is. Depth is that of the prediction."""
+    """All S cameras, in a frame of their own, at the scale where the median depth of the tracks is the predicted one;
+    those that are not refined follow the nearest one that is. Its depth maps are the prediction's."""
     refined: np.ndarray
     """(S,) bool, views with enough good observations that hang together."""
     tracks: MeasuredTracks
@@ -92,8 +93,6 @@ class Solution:
     """Share of all observations that are good: within the last gate, in tracks of sufficient angle."""
     depth_spread: float
     """Median absolute deviation of log(predicted depth / depth of the track): 0 when they agree up to one factor."""
-    depth_factor: float
-    """exp(median of log(predicted depth / depth of the track)) over the observations; 1 when there is no depth."""
 
 
 def pycolmap_module() -> ModuleType:
@@ -223,8 +222,11 @@ def _adjusted(
         return None
     xyz = xyz[alive][still]
     factor, spread = _against_depth(candidate, now, last, xyz)
+    T, xyz = now.T_cam_world.clone(), xyz * factor
+    T[:, :3, 3] *= factor
+    now = replace(now, T_cam_world=_following(candidate.T_cam_world, T, refined))
     return Solution(
-        candidate=replace(now, T_cam_world=_following(candidate.T_cam_world, now.T_cam_world, refined)),
+        candidate=now,
         refined=refined,
         tracks=last,
         xyz=xyz,
@@ -232,7 +234,6 @@ def _adjusted(
         cost=float(np.log1p(np.minimum(error, LOST_PX) ** 2).mean()),
         good=float(good.mean()),
         depth_spread=spread,
-        depth_factor=factor,
     )
 
 

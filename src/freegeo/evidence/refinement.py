@@ -273,15 +273,13 @@ def _mirrored(before: Tensor, after: Tensor, refined: np.ndarray) -> bool:
 
 
 def _result(reconstruction: Reconstruction, predicted: Candidate, matches: Matches, solution: Solution) -> Refinement:
-    """Return the solution at the prediction's scale, not accepted yet."""
+    """Return the solution in the prediction's frame, not accepted yet."""
     adjusted, tracks = solution.candidate, solution.tracks
-    # Lengths are multiplied about the camera that was held in place.
+    # The first refined view stays where it was predicted.
     still = int(tracks.view.min())
-    T = relative(adjusted.T_cam_world[still], adjusted.T_cam_world)
-    T[:, :3, 3] *= solution.depth_factor
-    T = T @ predicted.T_cam_world[still]
-    world = transform_points(adjusted.T_cam_world[still], torch.from_numpy(solution.xyz)) * solution.depth_factor
-    world = transform_points(inverse(predicted.T_cam_world[still]), world)
+    moved = inverse(adjusted.T_cam_world[still]) @ predicted.T_cam_world[still]
+    T = adjusted.T_cam_world @ moved
+    world = transform_points(inverse(moved), torch.from_numpy(solution.xyz))
     view = torch.from_numpy(tracks.view)
     pixel = predicted.in_model(view, torch.from_numpy(tracks.pixel)).numpy()
     first = np.searchsorted(tracks.point, np.arange(len(tracks)))
