@@ -143,6 +143,9 @@ def photos(arguments: argparse.Namespace) -> list[dict]:
         matched = time.process_time() - started
         K = torch.tensor([frame["K"] for frame in frames], dtype=torch.float64)
         truth = torch.tensor([frame["w2c"] for frame in frames], dtype=torch.float64)
+        # Six printed digits are not quite a rotation, which the pose score takes for an error of zero.
+        U, _, Vh = torch.linalg.svd(truth[:, :3, :3])
+        truth[:, :3, :3] = U @ Vh
         for seed in range(arguments.seeds):
             wrong = perturbed(truth, arguments.degrees, seed)
             prediction = _prediction(images, matches, wrong, K, 1 + arguments.focal * (-1) ** seed, truth)
