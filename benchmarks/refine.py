@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from record import write_result
 
 from freegeo.data.photos import load_photos
 from freegeo.data.procedural import get_domain, photograph_room
@@ -291,7 +292,9 @@ def main() -> None:
     rows = rooms(arguments) if arguments.kind == "rooms" else photos(arguments)
     print(room_table(rows) if arguments.kind == "rooms" else photo_table(rows))
     if arguments.out:
-        arguments.out.write_text(json.dumps(rows, indent=1))
+        settings = {name: value for name, value in vars(arguments).items() if name not in ("out", "folders")}
+        packages = ("torch", "numpy", "opencv-python-headless", "pycolmap")
+        write_result(arguments.out, settings=settings, results={"rows": rows}, packages=packages)
 
 
 if __name__ == "__main__":

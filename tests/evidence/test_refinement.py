@@ -16,6 +16,7 @@ from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.matches import Matches, Outcome
 from freegeo.evidence.refinement import bring_depth, parallax_px, refine
 from freegeo.evidence.tracks import join_matches
+from freegeo.export.colmap import write_colmap
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.geometry.camera import project
 from freegeo.geometry.depth import depth_to_world
@@ -197,6 +198,19 @@ def test_tracks_are_the_matched_pixels_not_projections():
     assert distance.max() < 1e-6
 
 
+def test_the_colmap_model_holds_the_measured_points(tmp_path):
+    import pycolmap
+
+    moved, _ = bring_depth(perturbed(scene()), refined())
+    write_colmap(moved, refined().tracks, tmp_path / "0")
+    model = pycolmap.Reconstruction(tmp_path / "0")
+    assert model.num_points3D() == len(refined().tracks)
+    # In photo pixels: the errors of the matches, not those of re-projections, which are 0.
+    tracks = refined().tracks
+    of_points = np.bincount(tracks.point, weights=refined().error_px) / np.bincount(tracks.point)
+    assert model.compute_mean_reprojection_error() == pytest.approx(of_points.mean(), rel=1e-3)
+
+
 def test_a_third_of_wrong_matches_does_no_harm():
     wrong = perturbed(scene())
     result = refine(wrong, matched(scene(), wrong=0.3))
@@ -315,6 +329,17 @@ def test_a_chain_that_leaves_one_photo_out_is_refined_without_it():
 def follow(scene: Reconstruction, view: int) -> np.ndarray:
     T = scene.T_cam_world.astype(np.float64)
     return T[5] @ np.linalg.inv(T[view])
+
+
+def test_a_photo_at_a_scale_of_its_own_is_not_refined():
+    wrong = perturbed(scene())
+    depth = wrong.depth_z.copy()
+    depth[5] *= 2
+    result = refine(replace(wrong, depth_z=depth), exact())
+    assert result.accepted, result.reason
+    assert result.refined.tolist() == [True] * 5 + [False]
+    depth[3:5] *= 2
+    refused(replace(wrong, depth_z=depth), exact(), "fit together in the end")
 
 
 def test_wrong_matches_for_the_most_part_are_refused():

@@ -59,6 +59,8 @@ class BundleSettings:
     """Two photos hang together when so many tracks show in both."""
     fewest_observations: int = 10
     """A photo with fewer good observations is not refined by itself."""
+    largest_factor: float = 1.5
+    """A photo whose tracks are farther or nearer than predicted by more, compared with the others, is not refined."""
     fewest_tracks: int = 30
     """Fewer tracks are not adjusted."""
     per_photo: int = 300
@@ -215,13 +217,20 @@ def _adjusted(
     last, alive = _selected(tracks, good)
     if not len(last):
         return None
-    enough = np.bincount(last.view, minlength=len(matches)) >= settings.fewest_observations
-    last, still = _selected(last, (enough & cluster(last, len(matches), settings.joined))[last.view])
-    refined = np.bincount(last.view, minlength=len(matches)) > 0
+    xyz = xyz[alive]
+    views = len(matches)
+    enough = np.bincount(last.view, minlength=views) >= settings.fewest_observations
+    enough &= _sized(candidate, now, last, xyz, settings.largest_factor)
+    last, still = _selected(last, (enough & cluster(last, views, settings.joined))[last.view])
+    refined = np.bincount(last.view, minlength=views) > 0
     if not refined.any():
         return None
-    xyz = xyz[alive][still]
-    factor, spread = _against_depth(candidate, now, last, xyz)
+    xyz = xyz[still]
+    ratio = _depth_ratios(candidate, now, last, xyz)
+    factor, spread = 1.0, 0.0
+    if np.isfinite(ratio).any():
+        middle = np.nanmedian(ratio)
+        factor, spread = float(np.exp(middle)), float(np.nanmedian(np.abs(ratio - middle)))
     T, xyz = now.T_cam_world.clone(), xyz * factor
     T[:, :3, 3] *= factor
     now = replace(now, T_cam_world=_following(candidate.T_cam_world, T, refined))
@@ -359,17 +368,25 @@ def _lifted(candidate: Candidate, tracks: MeasuredTracks) -> np.ndarray:
     return (sums / torch.bincount(point, minlength=len(tracks))[:, None]).numpy()
 
 
-def _against_depth(
-    predicted: Candidate, now: Candidate, tracks: MeasuredTracks, xyz: np.ndarray
-) -> tuple[float, float]:
-    """Factor from the tracks' depths to the predicted ones, and how far single ones are from it (log)."""
+def _depth_ratios(predicted: Candidate, now: Candidate, tracks: MeasuredTracks, xyz: np.ndarray) -> np.ndarray:
+    """Logarithm (m,) of predicted depth / depth of the track for each observation; nan where none is predicted."""
     there = transform_points(now.T_cam_world[tracks.view], torch.from_numpy(xyz)[tracks.point])[:, 2]
-    ratio = torch.log(depth_of(predicted, tracks) / there)
-    ratio = ratio[ratio.isfinite()].numpy()
-    if not len(ratio):
-        return 1.0, 0.0
-    middle = np.median(ratio)
-    return float(np.exp(middle)), float(np.median(np.abs(ratio - middle)))
+    return torch.log(depth_of(predicted, tracks) / there).numpy()
+
+
+def _sized(predicted: Candidate, now: Candidate, tracks: MeasuredTracks, xyz: np.ndarray, largest: float) -> np.ndarray:
+    """Which views (S,) bool see the tracks at the predicted depth, up to one factor for all and `largest` beyond it.
+
+    Where a part of the photos hangs on the rest by few tracks, it may end at a scale of its own.
+    """
+    ratio = _depth_ratios(predicted, now, tracks, xyz)
+    sized = np.ones(len(now), dtype=bool)
+    known = np.isfinite(ratio)
+    if known.any():
+        middle = np.median(ratio[known])
+        for view in np.unique(tracks.view[known]).tolist():
+            sized[view] = abs(np.median(ratio[known & (tracks.view == view)]) - middle) <= np.log(largest)
+    return sized
 
 
 def _following(predicted: Tensor, T_cam_world: Tensor, refined: np.ndarray) -> Tensor:
