@@ -1,0 +1,87 @@
+"""`refine`: a result whose cameras fit the photos better, or a sentence and nothing."""
+
+import json
+
+import numpy as np
+import pytest
+
+from evidence_tools import turned
+from freegeo.data.procedural import photograph_room
+from freegeo.evidence.candidate import Candidate
+from freegeo.evidence.matches import load_matches
+from freegeo.evidence.scores import epipolar
+from freegeo.export.photos import photo_records
+from freegeo.export.reconstruction import Reconstruction
+from freegeo.files import write_json
+
+VIEWS = 8
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    """The folder of a result with true depth and cameras that are turned by 2 degrees."""
+    import torch
+    from PIL import Image
+
+    from freegeo.data.photos import load_photos
+
+    pytest.importorskip("pycolmap", reason="needs the extra colmap")
+    folder = tmp_path_factory.mktemp("refine")
+    scene = photograph_room(30_300_000, "val-tex", frames=VIEWS)
+    (folder / "photos").mkdir()
+    for photo in scene.photos:
+        Image.fromarray(photo.read()).save(folder / "photos" / photo.name)
+    photos = load_photos(folder / "photos")
+    height, width = photos[0].size_hw
+    found = Reconstruction(
+        depth_z=scene.depth_z.numpy(), conf=np.ones((VIEWS, height, width), np.float32),
+        images=np.stack([photo.read() for photo in photos]), names=tuple(photo.name for photo in photos),
+        photo_hw=np.array([photo.size_hw for photo in photos]), scale_xy=np.ones((VIEWS, 2)),
+        offset_xy=np.zeros((VIEWS, 2)), T_cam_world=turned(scene.T_cam_world.double(), 2).float().numpy(),
+        K=scene.K.numpy(),
+    )  # fmt: skip
+    assert isinstance(scene.T_cam_world, torch.Tensor)
+    found.save(folder / "out")
+    records = {"format": 1, "images": list(found.names), "photo_files": photo_records(photos), "warnings": ["Old."]}
+    write_json(folder / "out" / "reconstruction.json", records)
+    return folder
+
+
+def test_refined_cameras_fit_the_photos(freegeo, result, tmp_path):
+    out = tmp_path / "refined"
+    outcome = freegeo("refine", result / "out", "-o", out, "--formats", "ply")
+    assert outcome.code == 0, outcome.err
+    matches = load_matches(out / "matches.npz")
+    assert matches is not None
+    before, after = (
+        epipolar(Candidate.of(Reconstruction.load(folder)), matches).mean for folder in (result / "out", out)
+    )
+    assert after < 0.2 * before
+    assert {"points.ply", "report.html", "kept.npz"} <= {path.name for path in out.iterdir()}
+    summary = json.loads((out / "reconstruction.json").read_text())
+    assert summary["refinement"]["probability"] >= 0.9
+    assert summary["warnings"][0] == "Old."
+    assert "already finished" in freegeo("refine", result / "out", "-o", out, "--formats", "ply").out
+
+
+def test_photos_that_cannot_judge_leave_nothing(freegeo, photo_folder, tiny, tmp_path):
+    pytest.importorskip("pycolmap", reason="needs the extra colmap")
+    assert freegeo("reconstruct", photo_folder, "-o", tmp_path / "out", *tiny, "--formats", "npz").code == 0
+    outcome = freegeo("refine", tmp_path / "out", "-o", tmp_path / "refined")
+    assert outcome.code == 1
+    assert "not refined, nothing is written" in outcome.sentence()
+    assert not (tmp_path / "refined" / "prediction.npz").exists()
+
+
+def test_photos_that_are_gone_are_missed(freegeo, result, tmp_path):
+    import shutil
+
+    shutil.copytree(result / "out", tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "reconstruction.json").read_text())
+    for record in summary["photo_files"]:
+        record["file"] = str(tmp_path / "nowhere")
+    write_json(tmp_path / "out" / "reconstruction.json", summary)
+    outcome = freegeo("refine", tmp_path / "out", "-o", tmp_path / "refined")
+    assert outcome.code == 2
+    assert "its photos are not where they were" in outcome.sentence()
+    assert not (tmp_path / "refined").exists()
