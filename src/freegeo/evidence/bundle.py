@@ -64,7 +64,7 @@ class BundleSettings:
     fewest_tracks: int = 30
     """Fewer tracks are not adjusted."""
     per_photo: int = 300
-    """So many tracks of each photo are adjusted, those that the most photos show; cameras do not get better by more."""
+    """So many tracks of each photo are adjusted, those that the most photos show."""
 
     def gates_px(self, match_hw: np.ndarray) -> list[float]:
         """Gates in matching pixels for photos of the sizes `match_hw` (S, 2), one for each adjustment."""
