@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from freegeo.adaptation.adapt import Adapted
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.dense import co_visible
 from freegeo.evidence.guard import Reference, State, Verdict, try_states
-from freegeo.evidence.matches import Matches, choose_pairs, find_matches, stored_matches
+from freegeo.evidence.matches import ALL_PAIRS_UP_TO, Matches, choose_pairs, find_matches, stored_matches
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.types import ImageBatch, PhotoLike
 
-logger = logging.getLogger(__name__)
 
-Guard = Literal["select", "report", "off"]
-ALL_PAIRS_UP_TO = 16
-"""Views up to which all pairs of photos are compared."""
+def scene_matches(
+    photos: Sequence[PhotoLike], prediction: Reconstruction, store: Path | None, *, device: str = "cpu"
+) -> Matches:
+    """Match the photos of a scene, or read their matches from `store`, which they are written to otherwise.
+
+    All pairs of few photos; of many, those that see the most of each other by the prediction.
+    """
+    share = None
+    if len(photos) > ALL_PAIRS_UP_TO:
+        share = co_visible(Candidate.of(prediction, device)).share
+    pairs = choose_pairs(len(photos), share)
+    return find_matches(photos, pairs) if store is None else stored_matches(store, photos, pairs)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,16 +39,6 @@ class Evidence:
     """Prediction of all photos by the frozen model."""
     store: Path | None = None
     """File for the matches; None: they are not stored."""
-
-    def matches(self, device: str) -> Matches:
-        """Match the photos, or read their matches."""
-        share = None
-        if len(self.photos) > ALL_PAIRS_UP_TO:
-            share = co_visible(Candidate.of(self.frozen, device)).share
-        pairs = choose_pairs(len(self.photos), share, all_up_to=ALL_PAIRS_UP_TO)
-        if self.store is None:
-            return find_matches(self.photos, pairs)
-        return stored_matches(self.store, self.photos, pairs)
 
 
 def judge_adapter(
@@ -78,7 +74,12 @@ def judge_adapter(
         found = [predict(scene.batch) for scene in scenes]
         return [Candidate.of(one, device) for one in found if one is not None] if None not in found else None
 
-    references = [Reference.of(Candidate.of(scene.frozen, device), scene.matches(device)) for scene in scenes]
+    references = [
+        Reference.of(
+            Candidate.of(scene.frozen, device), scene_matches(scene.photos, scene.frozen, scene.store, device=device)
+        )
+        for scene in scenes
+    ]
     try:
         verdict = try_states(predicted, references)
     finally:

@@ -23,7 +23,7 @@ from freegeo.adaptation.adapt import adapt as train_adapter
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.adapter_files import ADAPTER_FOLDER, METADATA
 from freegeo.adaptation.memory import plan_reconstruction
-from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Recipe
+from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Guard, Recipe
 from freegeo.adaptation.samples import SceneImages
 from freegeo.adaptation.state import remove_state
 from freegeo.data.photos import MAX_VIEWS, load_photos
@@ -40,7 +40,7 @@ from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import FORMAT, as_json, read_json, write_json
 from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
-from freegeo.guarded import Evidence, Guard, judge_adapter
+from freegeo.guarded import Evidence, judge_adapter
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import EMBEDDED_MODEL, warn_of_embedded_model
 from freegeo.models.images import read_photos
@@ -96,6 +96,10 @@ def _predict(
         tokens = embed_in_chunks(model, batch.images, device=compute.device)
         features = model.aggregate(tokens, reference=reference or model.spec.reference)
     return Reconstruction.from_prediction(model.decode(features), batch)
+
+
+def _capital(sentence: str) -> str:
+    return sentence[0].upper() + sentence[1:]
 
 
 def not_finite(result: Reconstruction) -> str | None:
@@ -258,7 +262,7 @@ def adapt(
             keep_after=() if guard == "off" else SHARES,
         )  # fmt: skip
     if result.trouble:
-        logger.warning("%s%s", result.trouble[0].upper(), result.trouble[1:])
+        logger.warning("%s", _capital(result.trouble))
     elif guard != "off":
         judge_by_photos(model, result, [(found, batch)], compute=compute, select=guard == "select")
     return result
@@ -411,7 +415,7 @@ class Job:
         verdict = about.get("verdict") or {}
         doubt = about.get("trouble") or (verdict.get("reason") if verdict.get("outcome") != "adapted" else None)
         if doubt:
-            self._warn(f"{self.adapter}: an adapter to be doubted. {doubt[0].upper()}{doubt[1:]}")
+            self._warn(f"{self.adapter}: an adapter to be doubted. {_capital(doubt)}")
         return adapter_files.load_adapter(self.model, self.adapter)
 
     def run(self) -> dict[str, Any]:
@@ -426,7 +430,7 @@ class Job:
             if rejected is None and not (verdict and self.guard == "select" and verdict["outcome"] != "adapted"):
                 final, rejected = self._adapted_prediction(frozen)
         if rejected is not None:
-            self._warn(f"{rejected[0].upper()}{rejected[1:]} The result is that of the frozen model.")
+            self._warn(f"{_capital(rejected)} The result is that of the frozen model.")
         if final is frozen:
             final.save(self.folder.path)
         report, failed = self._export(final, frozen)

@@ -25,6 +25,8 @@ logger = logging.getLogger(__name__)
 
 RecipeName = Literal["scene", "paper", "released-da3", "released-vggt"]
 DatasetName = Literal["eth3d", "7scenes", "scannetpp", "hiroom", "procedural"]
+Guard = Literal["select", "report", "off"]
+"""What the matches between the photos decide about an adapter (docs/guard.md)."""
 PAPER_SEED = 42
 """Seed of a published run: dataset-wise adaptation and the benchmark."""
 SEED = 43

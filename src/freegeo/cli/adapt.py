@@ -7,9 +7,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
 from freegeo.cli.jobs import LABELS, check_place, say_finished
-from freegeo.cli.options import Guard, ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
+from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source, split_scenes
 from freegeo.progress import step_bar
 

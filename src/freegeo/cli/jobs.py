@@ -8,9 +8,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
 from freegeo.cli.files import FileOptions, require_complete
-from freegeo.cli.options import Guard, ModelOptions, OutputOptions, RecipeOptions
+from freegeo.cli.options import ModelOptions, OutputOptions, RecipeOptions
 from freegeo.export import reconstruction as npz
 from freegeo.export.base import KEPT_NAME
 from freegeo.export.formats import FORMATS
@@ -120,7 +121,7 @@ def run_job(
             load=model_options.load, spec=empty.spec, batch=batch, folder=folder, recipe=plan, adapter=adapter,
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), warnings=console.warned(), after=after, formats=formats, photos=photos,
-            filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity(), guard=guard,
+            filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity, guard=guard,
             scene=None if plan is None else lambda model: scene_images("photos", photos, model, plan, batch),
         )  # fmt: skip
         summary = job.run()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -18,8 +19,6 @@ from freegeo.errors import UserError
 from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL, entry, warn_of_embedded_model
 from freegeo.models.spec import MIXED, Mixed
 
-Guard = Literal["select", "report", "off"]
-"""What the matches between the photos decide about an adapter (`freegeo.guarded`)."""
 SMALL_MODEL = 20_000_000
 """Parameters below which a model runs on one CPU thread."""
 
@@ -95,8 +94,9 @@ class ModelOptions:
 
         return weights_file(self.name, self.checkpoint)
 
+    @cached_property
     def checkpoint_identity(self) -> dict[str, str]:
-        """Return the name of the weight file and a fingerprint of its content."""
+        """Name of the weight file and a fingerprint of its content, looked up (and downloaded) once."""
         from freegeo.models.checkpoints import fingerprint
 
         path = self.weights()
@@ -107,7 +107,7 @@ class ModelOptions:
         compute = self.compute()
         return {
             "model": self.name,
-            "checkpoint": self.checkpoint_identity()["fingerprint"],
+            "checkpoint": self.checkpoint_identity["fingerprint"],
             "precision": compute.precision,
             "adapting_precision": None if recipe is None else compute.preferring(recipe.precision).precision,
             "seed": self.seed,

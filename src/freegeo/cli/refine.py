@@ -8,7 +8,7 @@ from typing import Annotated
 from freegeo.cli import console
 from freegeo.cli.export import find_photos
 from freegeo.cli.files import FORMAT_NAMES, require_complete
-from freegeo.cli.jobs import FILES
+from freegeo.cli.jobs import FILES, say_finished
 from freegeo.cli.options import OutputOptions
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.base import DEFAULT_FORMATS
@@ -31,16 +31,13 @@ def refine(
         Folder that `run` or `reconstruct` wrote.
     """
     from freegeo.evidence.bundle import pycolmap_module
-    from freegeo.evidence.candidate import Candidate
-    from freegeo.evidence.dense import co_visible
-    from freegeo.evidence.matches import choose_pairs, stored_matches
     from freegeo.evidence.refinement import bring_depth
     from freegeo.evidence.refinement import refine as refined_by
     from freegeo.export.formats import check_formats, export, filter_reconstruction
     from freegeo.export.kept import load_kept, load_masks, save_kept
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.files import read_json, write_json
-    from freegeo.guarded import ALL_PAIRS_UP_TO
+    from freegeo.guarded import scene_matches
     from freegeo.models.checkpoints import fingerprint
     from freegeo.pipeline import MATCHES_NAME, PREDICTION_NAME, SUMMARY_NAME
     from freegeo.report.page import write_report
@@ -59,11 +56,10 @@ def refine(
     }  # fmt: skip
     with run_folder(output.output, settings, overwrite=output.overwrite) as folder:
         if folder.finished:
-            console.say(f"{output.output}: already finished on {folder.finished_at}; nothing to do.")
+            say_finished(output.output, folder.finished_at)
             return
-        share = co_visible(Candidate.of(before)).share if len(photos) > ALL_PAIRS_UP_TO else None
         console.note("matches between the photos ...")
-        matches = stored_matches(folder / MATCHES_NAME, photos, choose_pairs(len(photos), share))
+        matches = scene_matches(photos, before, folder / MATCHES_NAME)
         console.note("bundle adjustment ...")
         found = refined_by(before, matches)
         if not found.accepted:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from freegeo.adaptation.recipe import Guard
 from freegeo.cli.files import FileOptions
 from freegeo.cli.jobs import DEFAULT_FILES, run_job
-from freegeo.cli.options import Guard, ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
+from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source
 
 DEFAULT_RECIPE, DEFAULT_MODEL, DEFAULT_PHOTOS = RecipeOptions(), ModelOptions(), PhotoOptions()

@@ -138,12 +138,6 @@ class Verdict:
             "chosen": None if self.chosen is None else list(self.trials).index(self.chosen),
         }  # fmt: skip
 
-    @property
-    def best(self) -> Trial | None:
-        """The chosen trial, or else the one with the greatest gain: what adaptation amounts to on this scene."""
-        known = [trial for trial in self.trials if not np.isnan(trial.gain)]
-        return self.chosen or max(known, key=lambda trial: trial.gain, default=None)
-
 
 def states() -> list[State]:
     """Return the states that are tried: the last step with every strength, and earlier steps with full strength."""
@@ -186,7 +180,7 @@ class Reference:
         Each is the mean over two sets of pixels, those that several views see by the one and by the other prediction.
         On one set alone the prediction that chose it would have the advantage: its surfaces are not hidden there.
         """
-        own = co_visible(candidate)
+        own = self.common if candidate is self.candidate else co_visible(candidate)
         tolerance = min(own.tolerance, self.common.tolerance)
         sets = [replace(pixels, tolerance=tolerance) for pixels in (self.common, own)]
         after, before = (
@@ -269,10 +263,9 @@ def judge(frozen: Measurement, found: Sequence[tuple[State, Measurement]], setti
 
 def too_little(frozen: Measurement, matches: Sequence[Matches], settings: GuardSettings) -> str | None:
     """Return why the matches of scenes cannot judge, in one sentence; None when they can."""
-    reasons = [one.reason() for one in matches]
-    reason = reasons[0]
-    if reason and all(reasons):
-        return f"Not enough matches to judge: {reason[0].lower()}{reason[1:]}"
+    reasons = [reason for reason in (one.reason() for one in matches) if reason]
+    if len(reasons) == len(matches):
+        return f"Not enough matches to judge: {reasons[0][0].lower()}{reasons[0][1:]}"
     known = _known(frozen)
     covered = len(np.unique(frozen.epipolar.pairs[known]))
     if known.sum() < settings.pairs:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from freegeo.types import PhotoLike
 
 __all__ = [
+    "ALL_PAIRS_UP_TO",
     "FILE_NAME",
     "MatchSettings",
     "Matches",
@@ -45,6 +46,8 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 FILE_NAME = "matches.npz"
+ALL_PAIRS_UP_TO = 16
+"""Photos up to which all pairs are compared."""
 VERSION = 1
 _LEAST_SENSE = 0.6
 """Below this share of neighbouring matches that turn the same way one photo is a mirror image of the other."""
@@ -179,7 +182,9 @@ _REASONS = {
 }
 
 
-def choose_pairs(views: int, share: np.ndarray | None = None, *, all_up_to: int = 16, partners: int = 8) -> np.ndarray:
+def choose_pairs(
+    views: int, share: np.ndarray | None = None, *, all_up_to: int = ALL_PAIRS_UP_TO, partners: int = 8
+) -> np.ndarray:
     """Return the pairs of views (Q, 2) int64 to compare, lower index first, sorted.
 
     Args:
