@@ -362,6 +362,7 @@ def test_the_state_that_the_guard_chose_is_the_adapter(model, tmp_path, judged, 
     assert np.allclose(used, expected, atol=1e-6)
     assert len({round(float(depth.sum()), 4) for _, depth in judged["tried"]}) == 7
     assert result.verdict is not None and result.verdict["outcome"] == "adapted"
+    assert result.verdict["reason"] == f"Because. It is used with {judged['state']}."
     result.save(tmp_path)
     result.adapter.detach()
     assert np.allclose(freegeo.reconstruct(model, pictures(), adapter=tmp_path).depth_z, used, atol=1e-6)
@@ -373,6 +374,7 @@ def test_an_adapter_that_the_guard_refuses_has_no_strength(model, judged, outcom
     judged["outcome"] = outcome
     result = freegeo.adapt(model, pictures(), steps=4, sets=2, lr=1e-2)
     assert close(freegeo.reconstruct(model, pictures()), before)
+    assert result.verdict is not None and result.verdict["reason"] == "Because. The frozen model is used."
     result.adapter.set_strength(1.0)
     assert not close(freegeo.reconstruct(model, pictures()), before)
 
@@ -383,6 +385,7 @@ def test_a_guard_that_reports_changes_nothing(model, judged):
     result.adapter.detach()
     plain = freegeo.adapt(model, pictures(), steps=4, sets=2, lr=1e-2, guard="off")
     assert result.verdict is not None and plain.verdict is None
+    assert result.verdict["reason"] == "Because. The adapter is used as it was trained (--guard report)."
     assert result.adapter.strength == 1
     assert same(reported, tensors(plain))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from freegeo.adaptation.adapt import Adapted
@@ -59,7 +59,7 @@ def judge_adapter(
         select: bring the adapter into the state that the verdict allows; with strength 0 where it allows none.
 
     Returns:
-        The verdict. Without `select` the adapter is as it was.
+        The verdict, its reason followed by what is used. Without `select` the adapter is as it was.
     """
     adapter = adapted.adapter
     final = {name: value.detach().cpu().clone() for name, value in adapter.named_parameters().items()}
@@ -84,9 +84,13 @@ def judge_adapter(
         verdict = try_states(predicted, references)
     finally:
         put(State(steps=1.0, strength=1.0))
-    if select and verdict.chosen is not None:
+    if not select:
+        used = "The adapter is used as it was trained (--guard report)."
+    elif verdict.chosen is not None:
         put(verdict.chosen.state)
         adapter.settle()
-    elif select:
+        used = f"It is used with {verdict.chosen.state}."
+    else:
         adapter.set_strength(0.0)
-    return verdict
+        used = "The frozen model is used."
+    return replace(verdict, reason=f"{verdict.reason} {used}")

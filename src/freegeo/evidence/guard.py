@@ -256,7 +256,7 @@ def judge(frozen: Measurement, found: Sequence[tuple[State, Measurement]], setti
     chosen = min(near, key=lambda trial: (trial.state.strength, trial.state.steps))
     reason = (
         f"Adaptation helped by the matches between the photos: {_changes(frozen, chosen.measured)} over {pairs} pairs "
-        f"({100 * chosen.probability:.0f} % sure); used with {chosen.state}."
+        f"({100 * chosen.probability:.0f} % sure)."
     )
     return Verdict(outcome="adapted", reason=reason, frozen=frozen, trials=tuple(trials), chosen=chosen, pairs=pairs)
 
@@ -318,16 +318,16 @@ def _veto(measured: Measurement, frozen: Measurement, fall: np.ndarray, settings
 
 def _why_not(trials: Sequence[Trial], pairs: int) -> str:
     if not trials:
-        return "Adaptation is not used because its predictions are no finite numbers; the frozen model is."
+        return "Adaptation cannot be used because its predictions are no finite numbers."
     vetoed = [trial for trial in trials if trial.veto is not None and trial.probability > 0]
     if all(trial.gain < 0 for trial in trials):
-        return f"Adaptation made the matches between the photos fit worse over {pairs} pairs; the frozen model is used."
+        return f"Adaptation made the matches between the photos fit worse over {pairs} pairs."
     if len(vetoed) == len(trials) and vetoed:
-        return f"Adaptation is not used because {vetoed[0].veto}; the frozen model is."
+        return f"Adaptation did harm that matches do not see: {vetoed[0].veto}."
     best = max((trial.probability for trial in trials), default=0.0)
     return (
         f"The matches between the photos do not prove that adaptation helped ({100 * best:.0f} % sure over {pairs} "
-        "pairs); the frozen model is used."
+        "pairs)."
     )
 
 

@@ -238,8 +238,8 @@ def verdict_table(verdict: Mapping[str, Any] | None) -> dict[str, Any] | None:
             label = (
                 "adapted" if whole else f"adapted, strength {trial['strength']:g}, {100 * trial['steps']:g} % of steps"
             )
-            used = f"{label} (used)" if number == chosen else label
-            rows.append((used, *_scores(trial), f"{100 * trial['probability']:.0f} %"))
+            named = f"{label} (chosen)" if number == chosen else label
+            rows.append((named, *_scores(trial), f"{100 * trial['probability']:.0f} %"))
     return {"outcome": verdict["outcome"], "reason": verdict["reason"], "pairs": verdict["pairs"], "rows": rows}
 
 
