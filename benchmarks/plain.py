@@ -16,8 +16,10 @@ from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.losses import LossConfig, StepDraws, TokenDraw, draw_tokens
 from freegeo.adaptation.recipe import Recipe
 from freegeo.models.api import ReconstructionModel
+from freegeo.models.precision import Compute
 
 CHUNK = 64
+CPU = Compute()
 
 
 def angle_chunk(p: Tensor, q: Tensor, tp: Tensor, tq: Tensor, k: Tensor, huber: bool) -> Tensor:
@@ -74,7 +76,7 @@ def relational(student: Tensor, teacher: Tensor, kept: tuple[int, ...], draws: S
     kept_teacher = teacher[list(kept)]
     (p, q), (tp, tq) = chosen(student, draws.angle), chosen(kept_teacher, draws.angle)
     k = anchors(kept_teacher[0], held_out, draws.angle, config)
-    weights = torch.tensor(config.angle_weights)
+    weights = student.new_tensor(config.angle_weights)
     queries = q.flatten(0, 1), tq.flatten(0, 1)
     phi = angle_loss(p, queries[0], tp, queries[1], k, huber=config.angle_penalty == "huber")
     (p, q), (tp, tq) = chosen(student, draws.distance), chosen(kept_teacher, draws.distance)
@@ -94,8 +96,8 @@ def intra(student: Tensor, teacher: Tensor, config: LossConfig) -> Tensor:
 class PlainAdaptation:
     """The loop's state: a teacher network, a student network with an adapter, an optimiser."""
 
-    def __init__(self, model: ReconstructionModel, recipe: Recipe, seed: int):
-        self.recipe, self.seed = recipe, seed
+    def __init__(self, model: ReconstructionModel, recipe: Recipe, seed: int, compute: Compute = CPU):
+        self.recipe, self.seed, self.compute = recipe, seed, compute
         self.teacher = copy.deepcopy(model).eval()
         self.student = model
         self.adapter = Adapter.attach(
@@ -107,26 +109,30 @@ class PlainAdaptation:
     def step(self, step: int, images: Tensor, kept: tuple[int, ...], lr: float) -> float:
         """Take a step on one view set, images (N, 3, H, W); returns the loss."""
         config, layers = self.recipe.loss, self.student.spec.loss_layers
-        with torch.no_grad():
-            teacher = self.teacher.aggregate(self.teacher.embed(images[None], layers=layers), layers=layers).levels
-        with torch.random.fork_rng():
+        images = images.to(self.compute.device)[None]
+        with torch.no_grad(), self.compute.autocast():
+            teacher = self.teacher.aggregate(self.teacher.embed(images, layers=layers), layers=layers).levels
+        with torch.random.fork_rng(), self.compute.autocast():
             torch.manual_seed(self.seed * 1_000_003 + step)
             self.student.train()
-            tokens = self.student.embed(images[list(kept)][None], layers=layers)
+            tokens = self.student.embed(images[:, list(kept)], layers=layers)
             student = self.student.aggregate(tokens, layers=layers).levels
             self.student.eval()
         every = config.cross_tokens == "all"
         student, teacher = (
-            {i: (torch.cat([special, patch], 2) if every else patch)[0] for i, (patch, special) in levels.items()}
+            {
+                i: (torch.cat([special, patch], 2) if every else patch)[0].float()
+                for i, (patch, special) in levels.items()
+            }
             for levels in (student, teacher)
         )
         draws = draw_tokens(
             config,
             tokens_per_view=student[layers[-1]].shape[1],
             student_views=len(kept),
-            held_out_views=len(images) - len(kept),
+            held_out_views=images.shape[1] - len(kept),
             generator=torch.Generator().manual_seed(self.seed * 1_000_003 + step),
-        )
+        ).to(images.device)
         loss = torch.stack([intra(student[i], teacher[i][list(kept)], config) for i in layers]).mean()
         loss = loss + relational(student[layers[-1]], teacher[layers[-1]], kept, draws, config)
         self.optimiser.zero_grad()

@@ -22,8 +22,10 @@ def machine() -> dict[str, object]:
     return described
 
 
-def write_result(path: Path, *, settings: dict, results: dict, packages: tuple[str, ...] = ("torch", "numpy")) -> None:
-    """Write and print the JSON record of one run."""
+def write_result(
+    path: Path, *, settings: dict, results: dict, packages: tuple[str, ...] = ("torch", "numpy"), show: bool = True
+) -> None:
+    """Write the JSON record of one run, and print it."""
     record = {
         "settings": settings,
         "results": results,
@@ -33,4 +35,5 @@ def write_result(path: Path, *, settings: dict, results: dict, packages: tuple[s
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps(record, indent=1)
     path.write_text(text + "\n", encoding="utf-8")
-    print(text)
+    if show:
+        print(text)

@@ -4,12 +4,25 @@ import os
 from pathlib import Path
 
 import torch
+from safetensors.torch import load_file
+from torch import Tensor
 
+from freegeo.models.precision import exact
+
+DEVICE = torch.device(os.environ.get("FREEGEO_DEVICE") or "cpu")
+"""Where networks, losses and functions are checked; on a GPU in float32 throughout, no TF32."""
+FULL_PRECISION = exact(DEVICE)
+FULL_PRECISION.__enter__()
 FIXTURES = Path(os.environ.get("FREEGEO_FIXTURES") or Path(__file__).parent / "fixtures")
 
 
 def fixture_path(*parts: str) -> Path:
     return FIXTURES.joinpath(*parts)
+
+
+def read_tensors(path: Path, device: torch.device = DEVICE) -> dict[str, Tensor]:
+    """The recorded tensors of a file."""
+    return load_file(path, device=str(device))
 
 
 def relative_error(actual, expected) -> float:

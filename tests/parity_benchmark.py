@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from fixture_tools import DEVICE
 from freegeo.benchmark import sampling
 from freegeo.benchmark.frames import fusion_frames
 from freegeo.benchmark.scene_score import (
@@ -181,10 +182,10 @@ def _tsdf_error(case: dict, arrays) -> float:
     from scipy.spatial import cKDTree
 
     name = case["name"]
-    volume = TsdfVolume(voxel=case["voxel_length"], truncation=case["sdf_trunc"])
+    volume = TsdfVolume(voxel=case["voxel_length"], truncation=case["sdf_trunc"], device=DEVICE)
     frames = zip(*(arrays[f"{name}/{key}"] for key in ("depths", "intrinsics", "extrinsics")), strict=True)
     for depth, K, T in frames:
-        volume.integrate(*(torch.from_numpy(a) for a in (depth, K, T)), depth_limit=case["max_depth"])
+        volume.integrate(*(torch.from_numpy(a).to(DEVICE) for a in (depth, K, T)), depth_limit=case["max_depth"])
     mesh = volume.extract_mesh()
     worst = _mesh_error(mesh, case, count_tolerance=5e-4)
     recorded = arrays[f"{name}/vertices_sorted"].astype(np.float64)

@@ -10,10 +10,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
-from fixture_tools import relative_error
+from fixture_tools import DEVICE, read_tensors, relative_error
 from freegeo.geometry.se3 import to_4x4
 from freegeo.models import reference
 from freegeo.models.catalog import build_empty
@@ -52,7 +51,7 @@ def build(folder: Path) -> DA3:
     """Build and load the small model of a fixture folder."""
     model = build_on_meta(lambda: empty_model(folder))
     load_weights(model, folder / "weights.safetensors", KEYS, folder.name)
-    return model.eval()
+    return model.eval().to(DEVICE)
 
 
 def empty_model(folder: Path) -> DA3:
@@ -76,9 +75,9 @@ def empty_model(folder: Path) -> DA3:
 @torch.no_grad()
 def check_network(folder: Path, case: dict) -> float:
     """Compare tokens, features, cameras and dense maps; the reference view must be the recorded one."""
-    model, wanted = build(folder), load_file(folder / case["file"])
+    model, wanted = build(folder), read_tensors(folder / case["file"])
     # The recorded images are already normalised; the model normalises by itself.
-    mean, std = (torch.tensor(v)[:, None, None] for v in (IMAGE_MEAN, IMAGE_STD))
+    mean, std = (torch.tensor(v, device=DEVICE)[:, None, None] for v in (IMAGE_MEAN, IMAGE_STD))
     tokens = model.embed(wanted["images"] * std + mean)
     cameras = None
     if "extrinsics_in" in wanted:
@@ -124,7 +123,7 @@ def block_outputs(
         block.register_forward_hook(lambda _m, _i, out, i=i: seen.__setitem__(f"block.{i}", out.reshape(shape)))
         for i, block in enumerate(model.backbone["pretrained"].blocks)
     ]
-    mean, std = (torch.tensor(v)[:, None, None] for v in (IMAGE_MEAN, IMAGE_STD))
+    mean, std = (torch.tensor(v, device=DEVICE)[:, None, None] for v in (IMAGE_MEAN, IMAGE_STD))
     model.aggregate(model.embed(wanted["images"] * std + mean), reference=case["ref_view_strategy"], cameras=cameras)
     for hook in hooks:
         hook.remove()

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import load_file
 
-from fixture_tools import relative_error
+from fixture_tools import DEVICE, read_tensors, relative_error
 from freegeo.errors import UserError
 from freegeo.geometry.camera import decode_camera_to_world, encode_camera_to_world
 from freegeo.geometry.rays import cameras_from_rays
@@ -43,7 +42,7 @@ class MemoryPhoto:
 
 
 def check_pos_embed(path: Path) -> float:
-    values = load_file(path)
+    values = read_tensors(path)
     backbone = Backbone(
         DA3Config(width=4, depth=2, heads=1, out_layers=(0, 1, 2, 3), alt_start=2, qknorm_start=9, rope_start=9,
                   head_features=8, head_channels=(4, 4, 4, 4))
@@ -59,27 +58,27 @@ def check_pos_embed(path: Path) -> float:
 
 def check_uv_embed(path: Path) -> float:
     errors = []
-    for name, wanted in load_file(path).items():
+    for name, wanted in read_tensors(path).items():
         if name.startswith("embed."):
             rows, columns, height, width, channels = (int(n) for n in re.findall(r"\d+", name))
-            errors.append(relative_error(uv_embedding(channels, (rows, columns), width / height, CPU), wanted))
+            errors.append(relative_error(uv_embedding(channels, (rows, columns), width / height, DEVICE), wanted))
     return max(errors) / FUNCTION
 
 
 def check_rope(path: Path) -> float:
-    values = load_file(path)
+    values = read_tensors(path)
     errors = []
     for k in range(3):
         x = values[f"x.{k}"]
         grid = tuple(values[f"grid_hw.{k}"].tolist())
         for kind, layout in (("local", "grid"), ("global", "flat")):
-            ours = rotate(x, grid_rope(grid, 1, x.shape[-1], layout, CPU))
+            ours = rotate(x, grid_rope(grid, 1, x.shape[-1], layout, DEVICE))
             errors.append(relative_error(ours, values[f"{kind}.{k}"]))
     return max(errors) / FUNCTION
 
 
 def check_pose_encoding(path: Path) -> float:
-    values = load_file(path)
+    values = read_tensors(path)
     image_hw = tuple(values["image_size_hw"].tolist())
     T_cam_world, K = decode_camera_to_world(values["dec.pose_enc"], image_hw)
     K_error = ((K - values["dec.intrinsics"]).abs() / values["dec.intrinsics"].abs().clamp_min(1e-12)).max()
@@ -92,13 +91,13 @@ def check_pose_encoding(path: Path) -> float:
 
 
 def check_normalize_extrinsics(path: Path) -> float:
-    values = load_file(path)
+    values = read_tensors(path)
     names = [n.removeprefix("in.") for n in values if n.startswith("in.")]
     return max(relative_error(normalise_poses(values[f"in.{k}"]), values[f"out.{k}"]) for k in names) / FUNCTION
 
 
 def check_reference_view(path: Path) -> float:
-    values = load_file(path)
+    values = read_tensors(path)
     for name, wanted in values.items():
         rule, _, k = name.partition(".")
         x = values[f"x.{k}"]
@@ -112,7 +111,7 @@ def check_reference_view(path: Path) -> float:
 
 
 def check_ray_pose(path: Path) -> float:
-    values = load_file(path)
+    values = read_tensors(path)
     image_hw = tuple(values["image_size_hw"].tolist())
     errors = []
     for k in (0, 1):
@@ -162,7 +161,7 @@ def check_batch_row(row: dict) -> bool:
 
 
 def check_image_pixels(path: Path) -> float:
-    values = load_file(path)
+    values = read_tensors(path, CPU)
     errors = []
     for name in (n for n in values if n.startswith("out.") and METHOD in n):
         _, k, _, side = name.split(".")

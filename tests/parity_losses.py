@@ -13,6 +13,7 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
+from fixture_tools import DEVICE
 from freegeo.adaptation.losses import (
     LossConfig,
     StepDraws,
@@ -41,7 +42,7 @@ def cases(folder: Path) -> Iterator[tuple[str, Callable[[], float]]]:
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    with safe_open(path, framework="pt") as file:
+    with safe_open(path, framework="pt", device=str(DEVICE)) as file:
         return {name: file.get_tensor(name) for name in file.keys()}, file.metadata()  # noqa: SIM118
 
 
@@ -116,7 +117,7 @@ def _released_config(family: str, recorded: dict) -> LossConfig:
 def _recorded_draws(expected: dict[str, Tensor], tokens: int, other_views: int) -> StepDraws:
     found = {}
     for part in ("angle", "distance"):
-        views = tokens * torch.arange(other_views)[:, None]
+        views = tokens * torch.arange(other_views, device=DEVICE)[:, None]
         found[part] = TokenDraw(
             reference=expected[f"index.{part}.ref"].long(),
             query=expected[f"index.{part}.shared"].long() + views,
@@ -180,7 +181,7 @@ def _check_paper(path: Path, dtype: torch.dtype) -> float:
     special, kept, patches = recorded["special_tokens"], recorded["student_views"], recorded["num_patches"]
     student, teacher = ({0: _split(expected[name], special, dtype)} for name in ("student", "teacher"))
     other = [view for view in range(len(kept)) if view != recorded["ref_view"]]
-    row = torch.tensor([other.index(int(view)) for view in expected["index.q_view"]])
+    row = torch.tensor([other.index(int(view)) for view in expected["index.q_view"]], device=DEVICE)
     draw = TokenDraw(
         reference=expected["index.ref_token"].long(),
         query=(row * patches + expected["index.q_token"].long())[None],

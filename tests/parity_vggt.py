@@ -10,10 +10,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
-from fixture_tools import relative_error
+from fixture_tools import DEVICE, read_tensors, relative_error
 from freegeo.geometry.depth import depth_to_world
 from freegeo.models.catalog import build_empty
 from freegeo.models.checkpoints import build_on_meta, load_weights
@@ -53,7 +52,7 @@ def build(folder: Path) -> VGGT:
     """Build and load the small model of a fixture folder."""
     model = build_on_meta(lambda: empty_model(folder))
     load_weights(model, folder / "weights.safetensors", KEYS, folder.name)
-    return model.eval()
+    return model.eval().to(DEVICE)
 
 
 def empty_model(folder: Path) -> VGGT:
@@ -78,7 +77,7 @@ def empty_model(folder: Path) -> VGGT:
 @torch.no_grad()
 def check_network(folder: Path, case: dict) -> float:
     """Compare patch tokens, every list entry, every camera step, cameras, dense maps and unprojected points."""
-    model, wanted = build(folder), load_file(folder / case["file"])
+    model, wanted = build(folder), read_tensors(folder / case["file"])
     tokens = model.embed(wanted["images"])
     features = model.aggregate(tokens)
     ours = found_tensors(model, tokens, features, model.decode(features, want=("depth", "cameras", "points")))
@@ -105,7 +104,7 @@ def found_tensors(model: VGGT, tokens: ViewTokens, features: Features, found: Pr
 
 def check_gradients(path: Path, recompute: bool) -> float:
     """Compare the loss and every parameter's gradient through two list entries."""
-    model, wanted = build(path.parent).requires_grad_(True).train(), load_file(path)
+    model, wanted = build(path.parent).requires_grad_(True).train(), read_tensors(path)
     model.aggregator.recompute = recompute
     levels = model.aggregate(model.embed(wanted["images"]), layers=(1, 3)).levels
     loss = sum(torch.cat(levels[layer], dim=2).square().mean() for layer in (1, 3))

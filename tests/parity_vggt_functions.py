@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from safetensors.torch import load_file
 
-from fixture_tools import relative_error
+from fixture_tools import DEVICE, read_tensors, relative_error
 from freegeo.data.photos import load_photos
 from freegeo.geometry.camera import decode_world_to_camera
 from freegeo.geometry.depth import depth_to_world, unproject, valid_depth
@@ -26,13 +25,13 @@ FUNCTION = 1e-5
 NETWORK = 1e-4
 OPENCV_LEVEL = 2 / 255
 MEAN = 1e-3
-CPU = torch.device("cpu")
 MODE = "longest504"
 """The recordings' name of the way photos are read here; they hold others too."""
+CPU = torch.device("cpu")
 
 
 def check_rotation(path: Path) -> float:
-    values = load_file(path)
+    values = read_tensors(path)
     return max(
         relative_error(quat_xyzw_to_matrix(values["quat_in"]), values["quat_to_mat"]) / FUNCTION,
         relative_error(matrix_to_quat_xyzw(values["mat_in"]), values["mat_to_quat"]) / FUNCTION,
@@ -40,7 +39,7 @@ def check_rotation(path: Path) -> float:
 
 
 def check_pose_encoding(path: Path) -> float:
-    values = load_file(path)
+    values = read_tensors(path)
     image_hw = tuple(values["image_hw"].tolist())
     errors = []
     for kind, pose in (("dec", values["dec_pose"]), ("roundtrip", values["enc_pose"])):
@@ -53,7 +52,7 @@ def check_pose_encoding(path: Path) -> float:
 
 
 def check_geometry(path: Path) -> float:
-    values = load_file(path)
+    values = read_tensors(path)
     if not torch.equal(valid_depth(values["depth"]), values["valid_mask"]):
         return math.inf
     T_cam_world, K = to_4x4(values["extrinsic"]), values["intrinsic"]
@@ -65,7 +64,7 @@ def check_geometry(path: Path) -> float:
 
 
 def check_rope(path: Path) -> float:
-    values = load_file(path)
+    values = read_tensors(path)
     errors = []
     for name in (n.removesuffix(".x") for n in values if n.endswith(".x")):
         for x, positions, wanted in zip(*(values[f"{name}.{part}"] for part in ("x", "pos", "y")), strict=True):
@@ -75,7 +74,7 @@ def check_rope(path: Path) -> float:
 
 
 def check_position_table(path: Path) -> float:
-    values = load_file(path)
+    values = read_tensors(path)
     errors = []
     for name in (n for n in values if n != "pos_embed"):
         height, width = (int(part[1:]) // 14 for part in name.split("_"))
@@ -86,16 +85,16 @@ def check_position_table(path: Path) -> float:
 
 def check_uv_embedding(path: Path) -> float:
     errors = []
-    for name, wanted in load_file(path).items():
+    for name, wanted in read_tensors(path).items():
         if name.endswith(".embed"):
             channels, rows, columns, height, width = (int(part[1:]) for part in name[: -len(".embed")].split("_"))
-            ours = 0.1 * uv_embedding(channels, (rows, columns), width / height, CPU)
+            ours = 0.1 * uv_embedding(channels, (rows, columns), width / height, DEVICE)
             errors.append(relative_error(ours, wanted))
     return max(errors) / FUNCTION
 
 
 def check_activations(path: Path) -> float:
-    values = load_file(path)
+    values = read_tensors(path)
     points = point_map(values["x"])["points"]
     depth = depth_maps(values["x"][:, :2])
     return max(
@@ -108,8 +107,8 @@ def check_activations(path: Path) -> float:
 
 @torch.no_grad()
 def check_camera_head(path: Path) -> float:
-    values = load_file(path)
-    head = CameraHead(channels=64, depth=1, heads=4)
+    values = read_tensors(path)
+    head = CameraHead(channels=64, depth=1, heads=4).to(DEVICE)
     prefix = "camera_head."
     head.load_state_dict({k.removeprefix(prefix): v.float() for k, v in values.items() if k.startswith(prefix)})
     poses = head(values["tokens_last"][:, :, 0], steps=6)
@@ -122,7 +121,7 @@ def check_preprocess(path: Path) -> float:
     if not all(check_sizes(row) for row in table["sizes"]):
         return math.inf
     pixels = path.with_name("preprocess_pixels.safetensors")
-    values = load_file(pixels) if pixels.is_file() else {}
+    values = read_tensors(pixels, CPU) if pixels.is_file() else {}
     cases = [case for case in table["pixels"] if values and case["mode"] == MODE]
     return max((check_pixels(case, values) for case in cases), default=0.0)
 

@@ -94,8 +94,8 @@ def _predict(
     model.to(compute.device).eval()
     with compute.autocast():
         tokens = embed_in_chunks(model, batch.images, device=compute.device)
-        features = model.aggregate(tokens, reference=reference or model.spec.reference)
-    return Reconstruction.from_prediction(model.decode(features), batch)
+        prediction = model.decode(model.aggregate(tokens, reference=reference or model.spec.reference))
+    return Reconstruction.from_prediction(prediction, batch)
 
 
 def _capital(sentence: str) -> str:

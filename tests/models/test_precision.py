@@ -77,3 +77,13 @@ def test_linear_layers_run_in_the_precision_and_heads_in_float32(precision):
         features = model.aggregate(model.embed(noise(3)[None]))
     assert seen == [DTYPES[precision]]
     assert model.decode(features).depth_z.dtype == torch.float32
+
+
+def test_fp32_on_a_gpu_is_computed_without_tf32_and_leaves_the_settings_as_they_were():
+    settings = [torch.backends.cuda.matmul, torch.backends.cudnn.conv, torch.backends.cudnn.rnn]
+    before = [each.fp32_precision for each in settings]
+    with Compute(device=torch.device("cuda")).autocast():
+        assert [each.fp32_precision for each in settings] == ["ieee"] * 3
+    assert [each.fp32_precision for each in settings] == before
+    with Compute().autocast():
+        assert [each.fp32_precision for each in settings] == before

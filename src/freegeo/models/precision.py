@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Generator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -43,7 +44,7 @@ class Compute:
         return replace(self, precision=choose_precision(precision, self.device))
 
     def autocast(self) -> AbstractContextManager:
-        """Return the context that a model's embed and aggregate run in."""
+        """Return the context that a model runs in; its heads and norms stay in float32 by themselves."""
         return autocast(self.device, self.precision)
 
 
@@ -76,5 +77,30 @@ def choose_precision(name: str | None, device: torch.device) -> Precision:
 
 
 def autocast(device: torch.device, precision: Precision) -> AbstractContextManager:
-    """Return the context that a model's embed and aggregate run in."""
-    return nullcontext() if precision == "fp32" else torch.autocast(device.type, _DTYPES[precision])
+    """Return the context that a model runs in; its heads and norms stay in float32 by themselves."""
+    return exact(device) if precision == "fp32" else torch.autocast(device.type, _DTYPES[precision])
+
+
+@contextmanager
+def exact(device: torch.device) -> Generator[None]:
+    """Compute float32 products and convolutions on a CUDA device in full precision, not in TF32.
+
+    cuDNN's convolutions take TF32 unless told otherwise. These are global settings; they are restored afterwards.
+    """
+    switches = _tf32_switches() if device.type == "cuda" else []
+    before = [getattr(settings, name) for settings, name, _ in switches]
+    for settings, name, full in switches:
+        setattr(settings, name, full)
+    try:
+        yield
+    finally:
+        for (settings, name, _), value in zip(switches, before, strict=True):
+            setattr(settings, name, value)
+
+
+def _tf32_switches() -> list[tuple[Any, str, str | bool]]:
+    """Return object, attribute and value in full precision of the settings that allow TF32, by PyTorch's version."""
+    matmul, cudnn = torch.backends.cuda.matmul, torch.backends.cudnn
+    if hasattr(cudnn, "conv"):
+        return [(settings, "fp32_precision", "ieee") for settings in (matmul, cudnn.conv, cudnn.rnn)]
+    return [(settings, "allow_tf32", False) for settings in (matmul, cudnn)]

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
+from freegeo.models.precision import exact
+
 # Elements per block of a temporary array. On a CPU 0.5 MB in float32: the arrays in play stay in the shared cache, and
 # the cost of an operator call (a few microseconds) stays small. On an accelerator a block only has to bound the memory.
 CPU_BLOCK_ELEMENTS = 1 << 17
@@ -48,18 +50,7 @@ def doubled(tensor: Tensor) -> Tensor:
 def exact_matmul(tensor: Tensor) -> Generator[None]:
     """Matrix products on the device of `tensor` in the full precision of their inputs: no autocast, no TF32.
 
-    A KL value is a small difference of large logarithms, for which TF32 is too coarse. TF32 is a global setting; its
-    previous value is restored afterwards.
+    A KL value is a small difference of large logarithms, for which TF32 is too coarse.
     """
-    with torch.autocast(device_type=tensor.device.type, enabled=False):
-        if tensor.device.type != "cuda":
-            yield
-            return
-        settings = torch.backends.cuda.matmul
-        name, exact = ("fp32_precision", "ieee") if hasattr(settings, "fp32_precision") else ("allow_tf32", False)
-        previous = getattr(settings, name)
-        setattr(settings, name, exact)
-        try:
-            yield
-        finally:
-            setattr(settings, name, previous)
+    with torch.autocast(device_type=tensor.device.type, enabled=False), exact(tensor.device):
+        yield
