@@ -27,8 +27,8 @@ from record import write_result
 ROOT = Path(__file__).resolve().parent.parent
 SEED = 42
 LIMITS_S = {
-    "parity": 120, "commands": 150, "steps": 150, "job": 120, "plain": 60, "reconstruct": 60, "precision": 60,
-    "fusion": 90, "training": 60, "compile": 90,
+    "parity": 200, "commands": 240, "steps": 150, "job": 120, "plain": 60, "reconstruct": 60, "precision": 60,
+    "fusion": 90, "saved": 40, "profile": 60, "training": 60, "compile": 90,
 }  # fmt: skip
 """Parts in the order in which they run, and how long each may take."""
 BIG, MIDDLE, OTHER = "da3-giant", "da3-base", "vggt-1b"
@@ -94,6 +94,12 @@ class Bench:
         import torch
 
         return torch.cuda.max_memory_allocated() / 1e9 if self.device.type == "cuda" else None
+
+    def held_gb(self) -> float | None:
+        """Memory that tensors hold now."""
+        import torch
+
+        return torch.cuda.memory_allocated() / 1e9 if self.device.type == "cuda" else None
 
     def now(self) -> float:
         """Wall clock, once the device has done all its work."""
@@ -257,6 +263,7 @@ def plain(bench: Bench) -> None:
     from plain import PlainAdaptation
 
     from freegeo.adaptation.adapt import learning_rate
+    from freegeo.adaptation.samples import released_augmentation
     from freegeo.adaptation.views import schedule
 
     for name in (BIG, MIDDLE):
@@ -266,13 +273,15 @@ def plain(bench: Bench) -> None:
         recipe = one_set_recipe(model, RECIPES[name])
         scenes = noise_scenes(2, 8, (bench.side(518),) * 2)
         visits = schedule([8, 8], recipe, SEED)
+        with bench.case(f"{name}, freegeo") as found:
+            adaptation_case(bench, model, scenes, recipe, found, place="device", checkpointing=False)
         with bench.case(name) as found:
             reference = PlainAdaptation(model, recipe, SEED, bench.compute)
             took, losses = [], []
             for number in range(2):
                 view_set = visits[number][0].view_set
                 started = bench.now()
-                images = scenes[view_set.scene].load(view_set.frames)
+                images = released_augmentation(scenes[view_set.scene].load(view_set.frames), view_set.seed)
                 rate = learning_rate(number, len(visits), recipe)
                 losses.append(reference.step(number, images, view_set.kept, rate))
                 took.append(bench.now() - started)
@@ -308,11 +317,104 @@ def reconstruct(bench: Bench) -> None:
                 parts, fitting = plan_reconstruction(model, views, hw, compute=bench.compute)
                 took = bench.seconds(lambda m=model, b=batch: predict(m, b, compute=bench.compute), repeats=2)
                 planned, peak = sum(size for _, size in parts) / 1e9, bench.peak_gb()
+                found["stage_peaks_gb"] = stage_peaks(bench, model, batch)
                 found |= {
                     "s": took, "peak_gb": peak, "planned_gb": planned, "planned_over_peak": peak and planned / peak,
                     "planned_parts_gb": {part: size / 1e9 for part, size in parts}, "would_fit": fitting,
                 }  # fmt: skip
         del model
+
+
+def stage_peaks(bench: Bench, model, batch) -> dict[str, float | None]:
+    """Peak of each of the three stages of a reconstruction."""
+    import torch
+
+    from freegeo.models.api import embed_in_chunks
+
+    found = {}
+    with torch.no_grad(), bench.compute.autocast():
+        bench.forget()
+        tokens = embed_in_chunks(model, batch.images, device=bench.device)
+        found["embedding"] = bench.peak_gb()
+        bench.forget()
+        features = model.aggregate(tokens, reference=model.spec.reference)
+        found["aggregating"] = bench.peak_gb()
+        bench.forget()
+        model.decode(features)
+        found["decoding"] = bench.peak_gb()
+    return found
+
+
+def saved(bench: Bench) -> None:
+    """What autograd keeps of a student's pass (4 views of 518 pixels, adapter of rank 32), by type and shape."""
+    from collections import Counter
+
+    import torch
+
+    from freegeo.adaptation.adapter import Adapter
+    from freegeo.adaptation.memory import shape_of
+
+    for name in (BIG, OTHER, MIDDLE):
+        model = bench.model(name)
+        adapter = Adapter.attach(model, rank=32, alpha=32, dropout=0.0, generator=torch.Generator().manual_seed(0))
+        images = noise_batch(4, (bench.side(518),) * 2).images.to(bench.device)[None]
+        with bench.case(name) as found, bench.compute.autocast():
+            tokens = model.embed(images, layers=model.spec.loss_layers)
+            seen: dict[int, tuple[str, int]] = {}
+
+            def keep(tensor, seen=seen):
+                storage = tensor.untyped_storage()
+                seen[storage.data_ptr()] = (f"{str(tensor.dtype)[6:]} {tuple(tensor.shape)}", storage.nbytes())
+                return tensor
+
+            before = bench.held_gb()
+            with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+                levels = model.aggregate(tokens, layers=model.spec.loss_layers).levels
+            after, peak = bench.held_gb(), bench.peak_gb()
+            weights = {p.untyped_storage().data_ptr() for p in model.parameters()}
+            kept = [entry for place, entry in seen.items() if place not in weights]
+            bytes_of = Counter()
+            for label, size in kept:
+                bytes_of[label] += size
+            shape, count = shape_of(model), tokens.tokens.shape[1] * tokens.tokens.shape[2]
+            found |= {
+                "before_gb": before, "after_gb": after, "peak_gb": peak, "tokens": count,
+                "saved_gb": sum(size for _, size in kept) / 1e9, "blocks": shape.blocks,
+                "planned_bytes_per_token_and_block": shape.saved_per_token(bench.compute, rank=32, dropout=False),
+                "by_shape_mb": {label: round(size / 1e6, 1) for label, size in bytes_of.most_common(40)},
+                "how_many": dict(Counter(label for label, _ in kept).most_common(40)),
+            }  # fmt: skip
+            del levels
+        adapter.detach()
+        del model
+
+
+def profile(bench: Bench) -> None:
+    """Where a later step of the big model spends its time: the operations that take the device longest."""
+    import torch
+    from torch.profiler import ProfilerActivity
+
+    from freegeo.adaptation.adapt import adapt
+
+    model = bench.model(BIG)
+    recipe = one_set_recipe(model, RECIPES[BIG], epochs=3)
+    profiler = torch.profiler.profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA])
+    with bench.case(BIG) as found:
+
+        def on_step(progress) -> None:
+            if progress.step == 2:
+                bench.now()
+                profiler.start()
+            if progress.step == 4:
+                bench.now()
+                profiler.stop()
+
+        adapt(
+            model, noise_scenes(2, 8, (bench.side(518),) * 2), recipe, seed=SEED, compute=bench.compute, on_step=on_step
+        )
+        events = sorted(profiler.key_averages(), key=lambda e: -(e.self_device_time_total or e.self_cpu_time_total))
+        found["ms_of_2_steps"] = {e.key[:80]: [round(e.self_device_time_total / 1e3, 2), e.count] for e in events[:40]}
+        found["device_ms"] = sum(e.self_device_time_total for e in events) / 1e3
 
 
 def precision(bench: Bench) -> None:
@@ -438,13 +540,20 @@ def environment(**changes: str) -> dict[str, str]:
 def parity(bench: Bench) -> None:
     """The recorded numbers of networks, losses, functions and fusion, on the device, in float32 without TF32."""
     with bench.case("fixtures") as found:
-        done = subprocess.run(
+        errors, failed = {}, {}
+        with subprocess.Popen(
             [sys.executable, "parity.py"], cwd=ROOT / "tests", env=environment(FREEGEO_DEVICE=str(bench.device)),
-            stdout=subprocess.PIPE, text=True, check=False,
-        )  # fmt: skip
-        lines = re.findall(r"^(\S+): error (\S+) of the tolerance (\S+)$", done.stdout, re.MULTILINE)
-        found["cases"], found["failed"] = len(lines), {name: error for name, error, word in lines if word != "ok"}
-        found["worst"] = sorted(((float(error), name) for name, error, _ in lines), reverse=True)[:8]
+            stdout=subprocess.PIPE, text=True,
+        ) as process:  # fmt: skip
+            for line in process.stdout:
+                if match := re.match(r"(\S+): error (\S+) of the tolerance (\S+)", line):
+                    name, error, word = match.groups()
+                    errors[name] = float(error)
+                    failed |= {name: float(error)} if word != "ok" else {}
+                    found |= {"cases": len(errors), "failed": failed}
+                    found["worst"] = sorted(((e, n) for n, e in errors.items()), reverse=True)[:8]
+                    if len(errors) % 20 == 0:
+                        bench.keep("fixtures", {**found, "so_far_s": round(time.monotonic() - bench.started)})
 
 
 def commands(bench: Bench) -> None:
@@ -485,7 +594,8 @@ def commands(bench: Bench) -> None:
 
 PARTS: dict[str, Callable[[Bench], None]] = {
     "parity": parity, "commands": commands, "steps": steps, "job": job, "plain": plain, "reconstruct": reconstruct,
-    "precision": precision, "fusion": fusion, "training": training, "compile": compiled,
+    "precision": precision, "fusion": fusion, "saved": saved, "profile": profile, "training": training,
+    "compile": compiled,
 }  # fmt: skip
 
 
