@@ -12,22 +12,21 @@ from safetensors import safe_open
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import read_json
 from freegeo.models.catalog import load_model
-from freegeo.training import loop, pool, state
+from freegeo.training import loop, state
 from freegeo.training.loop import train
-
-pytestmark = pytest.mark.usefixtures("small_shards")
 
 KILLED_RUN = """
 import os, signal, sys
 from pathlib import Path
-from freegeo.training import loop, pool
+from freegeo.training import loop
 from freegeo.training.config import TrainConfig
-pool.ROOMS_PER_SHARD = 2
 loop.SAVE_EVERY_S = 0.0
 def progress(state):
     if state.step == 4:
         os.kill(os.getpid(), signal.SIGKILL)
-config = TrainConfig(views=40, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1, cooldown=0.25)
+config = TrainConfig(
+    views=40, views_per_step=4, rooms=6, rooms_per_shard=2, frames=4, warmup_views=8, depth_views=1, cooldown=0.25
+)
 loop.train(config, Path(sys.argv[1]), progress=progress)
 """
 
@@ -54,7 +53,6 @@ def whole_run(tmp_path_factory, small_config, stopped_run):
             shutil.copytree(folder, stopped_run)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pool, "ROOMS_PER_SHARD", 2)
         return train(small_config, folder, progress=save_and_copy)
 
 

@@ -20,7 +20,7 @@ from freegeo.training.objective import (
     zero_motion_rotation,
 )
 from freegeo.training.state import new_state
-from freegeo.types import Features, Prediction
+from freegeo.types import Features
 
 
 @pytest.fixture(scope="module")
@@ -108,12 +108,10 @@ def test_true_cell_depth_costs_nothing(batch):
 
 def test_true_depth_has_no_error_and_confidence_no_pull_on_depth(batch):
     depth = batch.depth_z[:, :1].clone().requires_grad_()
-    model = SimpleNamespace(decode=lambda features, want: Prediction(depth_z=depth, conf=2 * torch.ones_like(depth)))
-    terms = depth_terms(model, features_of(batch), batch.depth_z[:, :1], TrainConfig())
+    terms = depth_terms(depth, 2 * torch.ones_like(depth), batch.depth_z[:, :1], TrainConfig())
     assert max(terms["depth"], terms["gradient"]) < 1e-5
     off = (batch.depth_z[:, :1] * 1.1).requires_grad_()
-    model = SimpleNamespace(decode=lambda features, want: Prediction(depth_z=off, conf=2 * torch.ones_like(off)))
-    terms = depth_terms(model, features_of(batch), batch.depth_z[:, :1], TrainConfig())
+    terms = depth_terms(off, 2 * torch.ones_like(off), batch.depth_z[:, :1], TrainConfig())
     torch.testing.assert_close(terms["depth"], TrainConfig().weights.depth * torch.tensor(1.1).log())
     assert not terms["confidence"].requires_grad
 
@@ -123,8 +121,7 @@ def test_confidence_is_best_where_it_says_what_the_error_is(batch):
     shape = batch.depth_z[:, :1].shape
     # 0.3 / 0.2 = 1.5 is the best confidence for a log error of 0.2.
     wrong = batch.depth_z[:, :1] * torch.tensor(0.2).exp()
-    model = SimpleNamespace(decode=lambda features, want: Prediction(depth_z=wrong, conf=conf.expand(shape)))
-    terms = depth_terms(model, features_of(batch), batch.depth_z[:, :1], TrainConfig())
+    terms = depth_terms(wrong, conf.expand(shape), batch.depth_z[:, :1], TrainConfig())
     (gradient,) = torch.autograd.grad(terms["confidence"], conf)
     assert gradient.abs() < 1e-5
 
