@@ -104,3 +104,13 @@ def test_rate_warms_up_stays_and_cools_down():
     assert config.rate(1000) == config.rate(80_000) == 1
     assert config.rate(90_000) == pytest.approx(0.25)
     assert config.rate(100_000) == 0
+
+
+def test_the_schedule_follows_the_time_where_that_runs_out_first():
+    config = TrainConfig(views=100_000, minutes=1.0)
+    assert config.position(20_000, 6.0) == 20_000
+    assert config.position(20_000, 30.0) == 50_000
+    assert config.position(0, 60.0) == 100_000 and config.rate(config.position(0, 60.0)) == 0
+    continued = replace(config, begin=(10, 40_000))
+    assert continued.position(40_000, 30.0) == 70_000
+    assert replace(config, minutes=0.0).position(20_000, 1e9) == 20_000

@@ -109,8 +109,7 @@ def augment(batch: Batch, generator: torch.Generator) -> Batch:
     gain = gain * (0.93 + 0.14 * torch.rand(count, views, generator=generator))
     images = (images * to_device(gain, device)[:, :, None, None, None]).clamp(0, 1)
     mirrored = to_device(torch.rand(count, generator=generator) < 0.5, device)
-    flip = torch.ones(4, device=device)
-    flip[0] = -1.0
+    flip = torch.where(torch.arange(4, device=device) == 0, -1.0, 1.0)
     choose = mirrored[:, None, None, None]
     return replace(
         batch,

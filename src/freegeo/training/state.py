@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import logging
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from freegeo.files import atomic_path
-from freegeo.models.checkpoints import build_on_meta
+from freegeo.models.catalog import EMBEDDED_MODEL
+from freegeo.models.checkpoints import build_on_meta, find_file, load_weights
 from freegeo.models.da3 import DA3, Backbone
 from freegeo.models.da3_config import KEYS, build, embedded_spec
 from freegeo.models.transformer import Block, initialise
@@ -170,6 +174,23 @@ def build_optimisers(model: DA3, read_outs: ReadOuts, config: TrainConfig) -> tu
     for group in (*muon.param_groups, *adamw.param_groups):
         group[PLATEAU_LR] = group["lr"]
     return muon, adamw
+
+
+def trained_model(checkpoint: Path) -> DA3:
+    """Load weights of the embedded model in the shape that their run trained; UserError if they do not fit."""
+    path = find_file(checkpoint)
+    model = build_shape(trained_shape(path))
+    load_weights(model, path, KEYS, EMBEDDED_MODEL)
+    return model.eval()
+
+
+def trained_shape(path: Path) -> str:
+    """Return the name in `SHAPES` that a run left in its weight file; files of other origin have the shipped shape."""
+    shape = None
+    if path.suffix == ".safetensors":
+        with suppress(SafetensorError), safe_open(path, "pt") as file:  # `load_weights` says what is wrong with a file
+            shape = json.loads((file.metadata() or {}).get("config", "{}")).get("shape")
+    return shape if shape in SHAPES else TrainConfig().shape
 
 
 def averaged(state: State) -> DA3:
