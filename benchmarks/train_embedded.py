@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--trial", choices=("none", "eager", "both"), default="both")
     parser.add_argument("--compile", action="store_true", help="compile without a trial")
     parser.add_argument("--views-per-step", type=int)
-    parser.add_argument("--continue-from", type=Path)
+    parser.add_argument("--continue-from", type=Path, help=f"folder with the {RESTART_FILE} of an earlier run")
     parser.add_argument("--first-room", type=int, default=0)
     parser.add_argument("--peak", type=float, default=1.0)
     parser.add_argument("--device", default="cuda")
@@ -57,6 +57,9 @@ def main() -> None:
     print(f"views a second: {speeds}; compiled: {compiled}; {left:.0f} s left for the run", flush=True)
     run = Path(tempfile.mkdtemp()) / "run"
     config = replace(config, minutes=left / 60)
+    if given.continue_from:
+        seen = int(torch.load(given.continue_from / RESTART_FILE, weights_only=True)["counters"][1])
+        config = replace(config, views=config.views + seen, pairs_until=0, short_until=0, small_until=0)
     loop.train(
         config, run, device=given.device, compile_blocks=compiled, continue_from=given.continue_from,
         progress=Copies(config, run, given.output),

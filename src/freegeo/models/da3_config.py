@@ -138,7 +138,7 @@ def _later(name: str, licence: str, parameters: int, hub_id: str, what: str) -> 
 
 
 def embedded_spec(config: DA3Config) -> ModelSpec:
-    """Return the spec of an embedded model; its images are as large as its grid of positions."""
+    """Return how an embedded model is described; its images are as large as its grid of positions."""
     return ModelSpec(
         name=EMBEDDED_MODEL,
         patch_size=config.patch_size,

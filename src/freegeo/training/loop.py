@@ -246,8 +246,9 @@ def apply_gradients(state: State, rate: float, config: TrainConfig) -> torch.Ten
     parameters = [parameter for parameter in state.parameters() if parameter.grad is not None]
     usable = nn.utils.clip_grad_norm_(parameters, config.clip).isfinite()
     if config.broken_steps:
+        zero = torch.zeros((), device=usable.device)
         for parameter in parameters:
-            parameter.grad = torch.where(usable, cast(torch.Tensor, parameter.grad), 0.0)
+            parameter.grad = torch.where(usable, cast(torch.Tensor, parameter.grad), zero)
     for optimiser in state.optimisers:
         for group in optimiser.param_groups:
             group["lr"] = group[PLATEAU_LR] * rate
