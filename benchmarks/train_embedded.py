@@ -105,6 +105,7 @@ def trial(config: TrainConfig, seconds: float, *, compiled: bool, device: str) -
         return 0.0
     finally:
         loop.LOG_EVERY_STEPS = every
+        torch.compiler.reset()  # the compiled code of this model; the cache on disk stays
         if device == "cuda":
             print(f"peak memory {torch.cuda.max_memory_allocated() / 1e9:.1f} GB", flush=True)
             torch.cuda.empty_cache()

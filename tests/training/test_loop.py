@@ -189,13 +189,14 @@ def test_a_step_that_is_not_finite_is_left_out_where_that_is_allowed(tmp_path, s
 
     real = loop.objective
     monkeypatch.setattr(loop, "objective", broken_once)
-    weights = train(replace(small_config, broken_steps=1), tmp_path / "once")
+    config = replace(small_config, broken_steps=1, views=16)
+    weights = train(config, tmp_path / "once")
     assert all(torch.isfinite(value).all() for value in tensors(weights).values())
     last = json.loads((tmp_path / "once" / loop.LOG).read_text().splitlines()[-1])
     assert last["kind"] == "end" and last["broken_steps"] == 1
     monkeypatch.setattr(loop, "objective", lambda *given: {k: v * float("nan") for k, v in real(*given).items()})
     with pytest.raises(FreeGeoError, match="steps were not finite"):
-        train(replace(small_config, broken_steps=1), tmp_path / "always")
+        train(config, tmp_path / "always")
 
 
 def test_the_next_version_is_trained_within_its_time_and_started_from_half_precision(

@@ -119,6 +119,10 @@ def position(state: State, config: TrainConfig) -> float:
 
 def compile_all(state: State) -> None:
     """Compile the blocks of the backbone, for images and samples of any size."""
+    import torch._dynamo
+
+    # All blocks share one piece of code: about seven versions of it, next to the default limit of eight.
+    torch._dynamo.config.recompile_limit = 32
     for block in cast(Backbone, state.model.backbone["pretrained"]).blocks:
         block.compile(dynamic=True)
 
