@@ -119,10 +119,10 @@ def position(state: State, config: TrainConfig) -> float:
 
 def compile_all(state: State) -> None:
     """Compile the blocks of the backbone, for images and samples of any size."""
-    import torch._dynamo
+    from torch._dynamo import config as settings
 
     # All blocks share one piece of code: about seven versions of it, next to the default limit of eight.
-    torch._dynamo.config.recompile_limit = 32
+    settings.recompile_limit = 32  # ty: ignore[invalid-assignment]
     for block in cast(Backbone, state.model.backbone["pretrained"]).blocks:
         block.compile(dynamic=True)
 
