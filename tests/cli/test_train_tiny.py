@@ -1,21 +1,20 @@
 import json
-from functools import partial
 
 import pytest
 
 from freegeo.models.catalog import load_model
-from freegeo.training import config, loop, pool
+from freegeo.training import config, loop
 from freegeo.training.config import TrainConfig
 
 
 @pytest.fixture
 def small_run(monkeypatch):
     """A run of ten steps on six rooms."""
-    small = partial(TrainConfig, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1)
-    monkeypatch.setattr(config, "TrainConfig", small)
-    monkeypatch.setattr(pool, "ROOMS_PER_SHARD", 2)
+    small = TrainConfig(
+        views_per_step=4, rooms=6, rooms_per_shard=2, frames=4, warmup_views=8, depth_views=1, evaluate_every=20
+    )
+    monkeypatch.setitem(config.PRESETS, "v4", small)
     monkeypatch.setattr(loop, "LOG_EVERY_STEPS", 2)
-    monkeypatch.setattr(loop, "EVALUATE_EVERY_VIEWS", 20)
     monkeypatch.setattr(loop, "EVALUATION_ROOMS", 2)
 
 

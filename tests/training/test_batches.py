@@ -1,10 +1,11 @@
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
 
 from freegeo.geometry import se3
-from freegeo.training.batches import augment, shrink, to_batch, window
+from freegeo.training.batches import augment, shrink, to_batch, windows
 from freegeo.training.config import Phase, TrainConfig
 from freegeo.training.objective import cell_targets, partners
 
@@ -13,20 +14,31 @@ PHASE = Phase(views=(4,), max_stride=3, reach=10, side=64)
 
 def test_windows_are_evenly_spaced_inside_and_go_both_ways():
     generator = torch.Generator().manual_seed(0)
-    seen = [window(10, 4, PHASE, generator) for _ in range(200)]
+    seen = windows(200, 10, 4, PHASE, generator).tolist()
     for frames in seen:
         strides = {b - a for a, b in itertools.pairwise(frames)}
         assert len(strides) == 1
         assert min(frames) >= 0 and max(frames) <= 9
     assert {abs(frames[1] - frames[0]) for frames in seen} == {1, 2, 3}
     assert {frames[1] > frames[0] for frames in seen} == {True, False}
-    assert window(8, 8, PHASE, generator) in (list(range(8)), list(range(7, -1, -1)))
+    assert {tuple(frames) for frames in windows(20, 8, 8, PHASE, generator).tolist()} == {
+        tuple(range(8)), tuple(range(7, -1, -1))
+    }  # fmt: skip
+
+
+def test_any_view_may_come_first_and_the_others_stay_in_order():
+    generator = torch.Generator().manual_seed(0)
+    phase = replace(PHASE, any_reference=1.0)
+    seen = windows(200, 4, 4, phase, generator).tolist()
+    assert {frames[0] for frames in seen} == {0, 1, 2, 3}
+    assert all(frames[1:] in (sorted(frames[1:]), sorted(frames[1:], reverse=True)) for frames in seen)
+    assert all(sorted(frames) == [0, 1, 2, 3] for frames in seen)
 
 
 @pytest.mark.parametrize(("views", "strides"), [(2, {1, 2, 3}), (4, {1, 2, 3}), (6, {1, 2}), (8, {1}), (16, {1})])
 def test_windows_spread_within_their_reach_only(views, strides):
     generator = torch.Generator().manual_seed(0)
-    seen = [window(16, views, PHASE, generator) for _ in range(100)]
+    seen = windows(100, 16, views, PHASE, generator).tolist()
     assert {abs(frames[1] - frames[0]) for frames in seen} == strides
 
 
@@ -92,3 +104,13 @@ def test_rate_warms_up_stays_and_cools_down():
     assert config.rate(1000) == config.rate(80_000) == 1
     assert config.rate(90_000) == pytest.approx(0.25)
     assert config.rate(100_000) == 0
+
+
+def test_the_schedule_follows_the_time_where_that_runs_out_first():
+    config = TrainConfig(views=100_000, minutes=1.0)
+    assert config.position(20_000, 6.0) == 20_000
+    assert config.position(20_000, 30.0) == 50_000
+    assert config.position(0, 60.0) == 100_000 and config.rate(config.position(0, 60.0)) == 0
+    continued = replace(config, begin=(10, 40_000))
+    assert continued.position(40_000, 30.0) == 70_000
+    assert replace(config, minutes=0.0).position(20_000, 1e9) == 20_000

@@ -1,9 +1,13 @@
+import itertools
+import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,22 +16,22 @@ from safetensors import safe_open
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import read_json
 from freegeo.models.catalog import load_model
-from freegeo.training import loop, pool, state
+from freegeo.training import loop, state
 from freegeo.training.loop import train
-
-pytestmark = pytest.mark.usefixtures("small_shards")
+from freegeo.training.state import trained_model
 
 KILLED_RUN = """
 import os, signal, sys
 from pathlib import Path
-from freegeo.training import loop, pool
+from freegeo.training import loop
 from freegeo.training.config import TrainConfig
-pool.ROOMS_PER_SHARD = 2
 loop.SAVE_EVERY_S = 0.0
 def progress(state):
     if state.step == 4:
         os.kill(os.getpid(), signal.SIGKILL)
-config = TrainConfig(views=40, views_per_step=4, rooms=6, frames=4, warmup_views=8, depth_views=1, cooldown=0.25)
+config = TrainConfig(
+    views=40, views_per_step=4, rooms=6, rooms_per_shard=2, frames=4, warmup_views=8, depth_views=1, cooldown=0.25
+)
 loop.train(config, Path(sys.argv[1]), progress=progress)
 """
 
@@ -54,7 +58,6 @@ def whole_run(tmp_path_factory, small_config, stopped_run):
             shutil.copytree(folder, stopped_run)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pool, "ROOMS_PER_SHARD", 2)
         return train(small_config, folder, progress=save_and_copy)
 
 
@@ -121,7 +124,9 @@ def test_mistakes_about_the_run_to_continue_are_named(tmp_path, small_config, wh
         train(replace(small_config, views=30), tmp_path / "next", continue_from=whole_run.parent)
 
 
-@pytest.mark.parametrize("name, value", [("peak", 0.0), ("cooldown", 1.5), ("rooms", 0), ("first_room", -1)])
+@pytest.mark.parametrize(
+    "name, value", [("views_per_step", 1), ("peak", 0.0), ("cooldown", 1.5), ("rooms", 0), ("first_room", -1)]
+)
 def test_settings_out_of_range_are_refused(small_config, name, value):
     with pytest.raises(UserError, match=f"cannot train with {name.replace('_', '-')} {value}"):
         replace(small_config, **{name: value})
@@ -172,6 +177,61 @@ def test_a_broken_loss_stops_before_the_step_and_is_named(tmp_path, small_config
     with pytest.raises(FreeGeoError, match="training step 0: depth not finite"):
         train(small_config, tmp_path)
     assert not (tmp_path / loop.WEIGHTS).exists()
+
+
+def test_a_step_that_is_not_finite_is_left_out_where_that_is_allowed(tmp_path, small_config, monkeypatch):
+    calls = []
+
+    def broken_once(*arguments):
+        calls.append(None)
+        terms = real(*arguments)
+        return {name: value * float("nan") for name, value in terms.items()} if len(calls) == 2 else terms
+
+    real = loop.objective
+    monkeypatch.setattr(loop, "objective", broken_once)
+    config = replace(small_config, broken_steps=1, views=16)
+    weights = train(config, tmp_path / "once")
+    assert all(torch.isfinite(value).all() for value in tensors(weights).values())
+    last = json.loads((tmp_path / "once" / loop.LOG).read_text().splitlines()[-1])
+    assert last["kind"] == "end" and last["broken_steps"] == 1
+    monkeypatch.setattr(loop, "objective", lambda *given: {k: v * float("nan") for k, v in real(*given).items()})
+    with pytest.raises(FreeGeoError, match="steps were not finite"):
+        train(config, tmp_path / "always")
+
+
+def test_the_next_version_is_trained_within_its_time_and_started_from_half_precision(
+    tmp_path, small_config, monkeypatch
+):
+    ticks = itertools.count()
+    clock = SimpleNamespace(monotonic=lambda: next(ticks) / 10, process_time=time.process_time)
+    monkeypatch.setattr(loop, "time", clock)
+    config = replace(
+        small_config, shape="v5", side=32, views=10**9, minutes=0.04, cameras_given=0.5, any_reference=0.5,
+        render_share=0.2, rooms_at_start=4, views_per_step=8, depth_views=2, broken_steps=1,
+        pairs_until=10**9,
+    )  # fmt: skip
+    places = []
+    weights = train(config, tmp_path / "run", progress=lambda now: places.append(loop.position(now, config)))
+    assert places == sorted(places) and len(places) > 2
+    model = trained_model(weights)
+    assert model.config.width == 192 and weights.stat().st_size < 14.5e6
+    prediction = model.decode(model.aggregate(model.embed(torch.rand(1, 3, 3, 24, 32))))
+    assert torch.isfinite(prediction.depth_z).all()
+    (tmp_path / "run" / state.NEWEST_FILE).unlink()
+    restart = torch.load(tmp_path / "run" / state.RESTART_FILE, weights_only=True)
+    assert (tmp_path / "run" / state.RESTART_FILE).stat().st_size < 14.5e6
+    begun = []
+
+    def compare(now):
+        begun.append(now.step)
+        if len(begun) == 1:
+            name = "backbone.pretrained.blocks.4.mlp.fc1.weight"
+            kept = restart["model"][name].float()
+            # A step at the very beginning of the warm-up hardly moves the weights.
+            torch.testing.assert_close(now.model.state_dict()[name], kept, atol=2e-2, rtol=0)
+
+    train(config, tmp_path / "next", continue_from=tmp_path / "run", progress=compare)
+    assert begun[0] == restart["counters"][0] + 1
 
 
 def test_global_blocks_first_look_for_tokens_like_themselves(small_config):

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from freegeo.geometry import se3
 from freegeo.geometry.camera import K_from_fov
 from freegeo.geometry.depth import unproject
 from freegeo.geometry.rotation import matrix_to_quat_xyzw
@@ -12,6 +13,7 @@ from freegeo.training.config import TrainConfig
 from freegeo.training.objective import (
     Choice,
     camera_terms,
+    camera_tokens,
     cell_depth_term,
     cell_targets,
     depth_terms,
@@ -20,7 +22,7 @@ from freegeo.training.objective import (
     zero_motion_rotation,
 )
 from freegeo.training.state import new_state
-from freegeo.types import Features, Prediction
+from freegeo.types import Cameras, Features
 
 
 @pytest.fixture(scope="module")
@@ -108,12 +110,10 @@ def test_true_cell_depth_costs_nothing(batch):
 
 def test_true_depth_has_no_error_and_confidence_no_pull_on_depth(batch):
     depth = batch.depth_z[:, :1].clone().requires_grad_()
-    model = SimpleNamespace(decode=lambda features, want: Prediction(depth_z=depth, conf=2 * torch.ones_like(depth)))
-    terms = depth_terms(model, features_of(batch), batch.depth_z[:, :1], TrainConfig())
+    terms = depth_terms(depth, 2 * torch.ones_like(depth), batch.depth_z[:, :1], TrainConfig())
     assert max(terms["depth"], terms["gradient"]) < 1e-5
     off = (batch.depth_z[:, :1] * 1.1).requires_grad_()
-    model = SimpleNamespace(decode=lambda features, want: Prediction(depth_z=off, conf=2 * torch.ones_like(off)))
-    terms = depth_terms(model, features_of(batch), batch.depth_z[:, :1], TrainConfig())
+    terms = depth_terms(off, 2 * torch.ones_like(off), batch.depth_z[:, :1], TrainConfig())
     torch.testing.assert_close(terms["depth"], TrainConfig().weights.depth * torch.tensor(1.1).log())
     assert not terms["confidence"].requires_grad
 
@@ -123,8 +123,7 @@ def test_confidence_is_best_where_it_says_what_the_error_is(batch):
     shape = batch.depth_z[:, :1].shape
     # 0.3 / 0.2 = 1.5 is the best confidence for a log error of 0.2.
     wrong = batch.depth_z[:, :1] * torch.tensor(0.2).exp()
-    model = SimpleNamespace(decode=lambda features, want: Prediction(depth_z=wrong, conf=conf.expand(shape)))
-    terms = depth_terms(model, features_of(batch), batch.depth_z[:, :1], TrainConfig())
+    terms = depth_terms(wrong, conf.expand(shape), batch.depth_z[:, :1], TrainConfig())
     (gradient,) = torch.autograd.grad(terms["confidence"], conf)
     assert gradient.abs() < 1e-5
 
@@ -146,3 +145,20 @@ def test_choice_takes_one_view_of_some_samples(batch):
     chosen = Choice(samples=torch.tensor([1]), view=2)
     torch.testing.assert_close(chosen.of(batch.depth_z), batch.depth_z[1:, 2:3])
     assert chosen.of(features_of(batch)).levels[5][0].shape[:2] == (1, 1)
+
+
+def test_given_cameras_reach_their_samples_only_and_train_the_encoder(batch):
+    state = new_state(TrainConfig())
+    told = replace(batch, cameras_given=torch.tensor([False, True]))
+    tokens, learned = camera_tokens(state.model, told), camera_tokens(state.model, batch)
+    assert torch.equal(tokens[0], learned[0]) and not torch.allclose(tokens[1], learned[1])
+    camera = Cameras(
+        T_cam_world=se3.normalise_poses(se3.inverse(batch.T_world_cam)),
+        K=K_from_fov(*batch.fov_vh.unbind(-1), tuple(batch.images.shape[-2:])),
+    )
+    expected = state.model.encode_cameras(camera, tuple(batch.images.shape[-2:]))
+    torch.testing.assert_close(tokens[1], expected[1], atol=1e-4, rtol=1e-4)
+    config = TrainConfig(depth_views=1, cameras_given=0.5)
+    terms = objective(state.model, state.read_outs, told, config, 1, torch.Generator().manual_seed(0))
+    torch.stack(list(terms.values())).sum().backward()
+    assert all(parameter.grad is not None for parameter in state.model.cam_enc.parameters())

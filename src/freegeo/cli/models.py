@@ -180,13 +180,17 @@ def score(
     from freegeo.data.procedural import get_domain
     from freegeo.errors import UserError
     from freegeo.training.report_card import REPORTED_DOMAINS, card_tables, gate_lines, report_card
+    from freegeo.training.state import trained_model
 
     names = REPORTED_DOMAINS if domains is None else tuple(name.strip() for name in domains.split(","))
     if rooms < 1:
         raise UserError(f"--rooms must be at least 1, got {rooms}.")
     for name in names:
         get_domain(name).seeds(rooms)
-    loaded = catalog.load_model(model, checkpoint=checkpoint)
+    if checkpoint and catalog.entry(model).name == catalog.EMBEDDED_MODEL:
+        loaded = trained_model(checkpoint)
+    else:
+        loaded = catalog.load_model(model, checkpoint=checkpoint)
     use_few_threads(loaded)
     with progress_bar("domains", len(names)) as update:
         card = report_card(

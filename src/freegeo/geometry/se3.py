@@ -30,7 +30,8 @@ def to_4x4(T: Tensor) -> Tensor:
         return T
     if T.shape[-2:] != (3, 4):
         raise UserError(f"A camera pose must be a 3x4 or 4x4 matrix, got shape {tuple(T.shape)}.")
-    last_row = T.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*T.shape[:-2], 1, 4)
+    last_row = torch.zeros_like(T[..., :1, :])
+    last_row[..., 3] = 1.0
     return torch.cat((T, last_row), dim=-2)
 
 

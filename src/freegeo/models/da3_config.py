@@ -87,6 +87,12 @@ EMBEDDED = DA3Config(
     head_features=32, head_channels=(16, 32, 48, 64), patch_size=8, position_grid=8,
     camera_encoder_depth=1, camera_encoder_heads=4,
 )  # fmt: skip
+EMBEDDED_V5 = DA3Config(
+    width=192, depth=12, heads=6, alt_start=4, qknorm_start=4, rope_start=4, out_layers=(5, 7, 9, 11),
+    head_features=32, head_channels=(24, 48, 72, 96), patch_size=8, position_grid=12,
+    camera_encoder_depth=1, camera_encoder_heads=6,
+)  # fmt: skip
+"""The embedded model's next version, which `freegeo train-tiny --preset v5` trains; the package holds no weights."""
 
 _NORM = "head.scratch.output_conv2_aux"
 KEYS = KeyRules(
@@ -131,23 +137,27 @@ def _later(name: str, licence: str, parameters: int, hub_id: str, what: str) -> 
     return ModelEntry(name=name, about=about, licence=licence, parameters=parameters, hub_id=f"depth-anything/{hub_id}")
 
 
-def _embedded() -> ModelEntry:
-    spec = ModelSpec(
+def embedded_spec(config: DA3Config) -> ModelSpec:
+    """Return how an embedded model is described; its images are as large as its grid of positions."""
+    return ModelSpec(
         name=EMBEDDED_MODEL,
-        patch_size=EMBEDDED.patch_size,
-        default_side=64,
-        loss_layers=EMBEDDED.out_layers,
+        patch_size=config.patch_size,
+        default_side=config.patch_size * config.position_grid,
+        loss_layers=config.out_layers,
         reference="first",
         special_tokens=1,
         weights_licence=APACHE,
         adaptation=AdaptationDefaults(temperature=2.5, scene_lr=1e-3, rank=16, neighbours=True),
     )
+
+
+def _embedded() -> ModelEntry:
     return ModelEntry(
         name=EMBEDDED_MODEL,
         about="embedded, trained on generated rooms only: for demonstrations and tests, not for real photos",
         licence=APACHE,
         parameters=0,
-        build=partial(build, EMBEDDED, spec),
+        build=partial(build, EMBEDDED, embedded_spec(EMBEDDED)),
         keys=KEYS,
         packaged_weights=EMBEDDED_WEIGHTS,
     )

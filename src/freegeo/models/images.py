@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, get_args
 
 import torch
@@ -98,9 +99,16 @@ def _described(batch: ImageBatch, view: int) -> str:
 
 def normalise(images: Tensor) -> Tensor:
     """Subtract ImageNet's mean and divide by its deviation; (..., 3, H, W) in [0, 1]."""
-    mean = images.new_tensor(IMAGE_MEAN)[:, None, None]
-    std = images.new_tensor(IMAGE_STD)[:, None, None]
+    mean, std = _statistics(images.dtype, images.device)
     return (images - mean) / std
+
+
+@lru_cache(maxsize=8)
+def _statistics(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return mean and deviation, (3, 1, 1) each; copying them to a GPU at every call would wait for it."""
+    with torch.inference_mode(False):
+        mean, std = (torch.tensor(values, dtype=dtype, device=device) for values in (IMAGE_MEAN, IMAGE_STD))
+        return mean[:, None, None], std[:, None, None]
 
 
 def patch_grid(images: Tensor, patch: int) -> Size:

@@ -5,8 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from freegeo.errors import UserError
+from freegeo.models.da3_config import EMBEDDED, EMBEDDED_V5, DA3Config
 
-_SMALLEST = {"views": 1, "peak": 1e-6, "cooldown": 0.0, "rooms": 1, "first_room": 0}
+SHAPES: dict[str, DA3Config] = {"v4": EMBEDDED, "v5": EMBEDDED_V5}
+"""Models that can be trained: the shipped one, and its next version."""
+_SMALLEST = {
+    "views": 1,
+    "views_per_step": 2,
+    "peak": 1e-6,
+    "cooldown": 0.0,
+    "rooms": 1,
+    "first_room": 0,
+    "minutes": 0.0,
+}
 _LARGEST = {"peak": 1.0, "cooldown": 1.0}
 
 
@@ -40,12 +51,18 @@ class Phase:
     """Largest distance between the first and the last view, in frames; more views than that still follow each other."""
     side: int
     """Longest image side in pixels."""
+    any_reference: float = 0.0
+    """Share of the samples whose reference is any of its views instead of one end of the walk."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """Train the embedded model on generated rooms."""
 
+    shape: str = "v4"
+    """Which of `SHAPES`."""
+    minutes: float = 0.0
+    """Time that the run's schedule fits in, all legs together; the cool-down then ends by itself. 0: no limit."""
     views: int = 700_000
     """Views the model learns from, counted with repetition; the last `cooldown` of them lower the learning rate."""
     begin: tuple[int, int] = (0, 0)
@@ -58,6 +75,13 @@ class TrainConfig:
     views_per_step: int = 48
     rooms: int = 7_680
     """Rooms in the pool; they are rendered a shard at a time while training goes on."""
+    rooms_per_shard: int = 96
+    rooms_at_start: int = 0
+    """Rooms to render before the first step."""
+    render_share: float = 0.0
+    """Share of the time in which new rooms are rendered. 0: a shard every 40 steps, which can be repeated exactly."""
+    field_of_view_deg: tuple[float, float] = (58.0, 72.0)
+    """Horizontal, one value per room."""
     first_room: int = 0
     """Rooms of the training domain to leave out, because an earlier run has learned from them."""
     frames: int = 16
@@ -80,36 +104,88 @@ class TrainConfig:
     """Views before the images reach their full size; at three quarters of it a view costs 40 % less."""
     reach: int = 10
     """Largest distance between the first and the last view of a sample, in frames, where its views are spread."""
+    any_reference: float = 0.0
+    """Share of the samples whose reference is any of its views instead of one end of the walk."""
+    cameras_given: float = 0.0
+    """Share of the samples whose cameras are given to the model, which trains its camera encoder."""
     depth_views: int = 8
     """Views that the dense head learns from in one step, at most one of each sample."""
     ray_branch_every: int = 8
     """Steps between two updates of the ray branch, which learns on detached features."""
+    evaluate_every: int = 25_000
+    """Views between two scores on validation rooms, which take a minute on one core. 0: none."""
+    broken_steps: int = 0
+    """Steps with a number that is not finite that are left out before the run ends with an error. More than 0 also
+    spares a GPU from waiting for the answer after every step."""
     weights: LossWeights = LossWeights()
 
     def __post_init__(self):
+        if self.shape not in SHAPES:
+            raise UserError(f"cannot train a model of shape '{self.shape}'. Choose one of {', '.join(SHAPES)}.")
         for name, smallest in _SMALLEST.items():
             value, largest = getattr(self, name), _LARGEST.get(name)
             if value < smallest or (largest is not None and value > largest):
                 limits = f"at least {smallest:g}" + (f" and at most {largest:g}" if largest is not None else "")
                 raise UserError(f"cannot train with {name.replace('_', '-')} {value}. Give {limits}.")
 
-    def phase(self, seen: int) -> Phase:
-        """Return the phase after `seen` views: short windows and small images come first."""
-        side = self.side * 3 // 4 if seen < self.small_until else self.side
-        if seen < self.pairs_until:
-            return Phase(views=(2, 3), max_stride=1, reach=self.reach, side=side)
-        if seen < self.short_until:
-            return Phase(views=(2, 3, 4), max_stride=2, reach=self.reach, side=side)
-        return Phase(views=(2, 4, 4, 4, 6, 8, 8, 8, 12, 16), max_stride=3, reach=self.reach, side=side)
+    def position(self, seen: int, seconds: float) -> float:
+        """Return the place in the schedule, in views: the views learned from, or further where the time runs out first.
 
-    def rate(self, seen: int) -> float:
+        The run is complete at `views`. `seconds` is the time that the run has taken so far.
+        """
+        if not self.minutes:
+            return seen
+        return max(seen, self.begin[1] + (self.views - self.begin[1]) * seconds / (60 * self.minutes))
+
+    def phase(self, position: float) -> Phase:
+        """Return the phase at a position of the schedule: short windows and small images come first."""
+        side = self.side * 3 // 4 if position < self.small_until else self.side
+        if position < self.pairs_until:
+            views, stride = (2, 3), 1
+        elif position < self.short_until:
+            views, stride = (2, 3, 4), 2
+        else:
+            views, stride = (2, 4, 4, 4, 6, 8, 8, 8, 12, 16), 3
+        return Phase(views=views, max_stride=stride, reach=self.reach, side=side, any_reference=self.any_reference)
+
+    def rate(self, position: float) -> float:
         """Return the factor on all learning rates: warm-up, plateau, quadratic cool-down to zero."""
-        warm = min(1.0, (seen - self.begin[1]) / self.warmup_views)
+        warm = min(1.0, (position - self.begin[1]) / self.warmup_views)
         start = self.cooldown_start
-        left = 1.0 if seen < start else max(0.0, (self.views - seen) / (self.views - start))
+        left = 1.0 if position < start else max(0.0, (self.views - position) / (self.views - start))
         return self.peak * warm * left**2
 
     @property
     def cooldown_start(self) -> float:
         """Number of views after which the cool-down begins."""
         return self.begin[1] + (self.views - self.begin[1]) * (1 - self.cooldown)
+
+
+PRESETS = {
+    "v4": TrainConfig(),
+    "v5": TrainConfig(
+        shape="v5",
+        views=6_000_000,
+        minutes=5.0,
+        side=96,
+        views_per_step=512,
+        rooms=24_000,
+        rooms_at_start=1_536,
+        render_share=0.15,
+        field_of_view_deg=(54.0, 76.0),
+        head_lr=6e-4,
+        warmup_views=120_000,
+        cooldown=0.8,
+        pairs_until=400_000,
+        short_until=1_000_000,
+        small_until=2_400_000,
+        any_reference=0.6,
+        cameras_given=0.25,
+        depth_views=96,
+        ema=0.995,
+        evaluate_every=0,
+        broken_steps=20,
+        weights=LossWeights(field_of_view=3.0),
+    ),
+}
+"""Settings by name: those of the shipped weights on the CPU, and those of the next version on a GPU."""

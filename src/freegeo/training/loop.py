@@ -6,18 +6,20 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import nn
 
 from freegeo import __version__
+from freegeo.data.procedural import get_domain
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import as_json, atomic_path, read_json, write_json, write_tensors
+from freegeo.models.da3 import Backbone
 from freegeo.run_folder import locked
 from freegeo.training.batches import Batch, draw_batch
 from freegeo.training.config import TrainConfig
@@ -28,12 +30,14 @@ from freegeo.training.state import (
     NEWEST_FILE,
     PLATEAU_FILE,
     PLATEAU_LR,
+    RESTART_FILE,
     START_FILE,
     State,
     averaged,
     new_state,
     resume,
     save,
+    save_restart,
 )
 from freegeo.training.workers import Crew
 
@@ -44,7 +48,6 @@ GROW_EVERY_STEPS = 40
 LOG_EVERY_STEPS = 100
 LOG_MEMORY = 0.98
 SAVE_EVERY_S = 120.0
-EVALUATE_EVERY_VIEWS = 25_000
 EVALUATION_ROOMS = 24
 
 
@@ -55,6 +58,7 @@ def train(
     minutes: float | None = None,
     workers: int = 1,
     device: str = "cpu",
+    compile_blocks: bool = False,
     continue_from: Path | None = None,
     progress: Callable[[State], None] = lambda state: None,
 ) -> Path:
@@ -62,11 +66,12 @@ def train(
 
     The same call continues a stopped run: with one worker it ends with the same tensors as a run that was never
     stopped. A larger `views` continues from the plateau before the cool-down. `workers` processes of one thread each
-    change the shared weights without locks; on another device than the CPU there is one. `continue_from` is the folder
-    of another run, whose state this one starts from, with settings and rooms of its own. UserError when the folder
-    holds a run with other settings or `continue_from` holds none; FreeGeoError when a loss is not finite or a worker
-    dies.
+    change the shared weights without locks; on another device than the CPU there is one. `compile_blocks` compiles the
+    blocks of the backbone first. `continue_from` is the folder of another run, whose state this one starts from, with
+    settings and rooms of its own. UserError when the folder holds a run with other settings or `continue_from` holds
+    none; FreeGeoError when too many losses are not finite or a worker dies.
     """
+    begun = time.monotonic()
     if workers < 1 or (workers > 1 and device != "cpu"):
         raise UserError(f"cannot train with {workers} workers on {device}. Use one, or several on the cpu.")
     with locked(folder), one_thread(device):
@@ -74,16 +79,24 @@ def train(
         keep_settings(config, folder)
         state = new_state(config, device)
         resume(state, config, folder)
+        seconds_before = state.seconds
+        if compile_blocks:
+            compile_all(state)
         pool = open_pool(config, state, folder, device)
         with Crew(state, config, folder, workers - 1) as crew:
             trainer = Trainer(state, pool, config, folder, crew.lock)
             deadline = time.monotonic() + 60 * (minutes if minutes is not None else float("inf"))
-            while state.seen < config.views and time.monotonic() < deadline:
+            while time.monotonic() < deadline:
+                state.counters[3] = seconds_before + time.monotonic() - begun
+                if position(state, config) >= config.views:
+                    break
                 crew.check()
                 trainer.step()
                 trainer.keep_record()
                 progress(state)
+        trainer.log("end", trainer.read_recent())
         save(state, config, folder / NEWEST_FILE)
+        save_restart(state, folder / RESTART_FILE)
         return write_weights(state, config, folder / WEIGHTS)
 
 
@@ -99,70 +112,147 @@ def one_thread(device: str):
         torch.set_num_threads(before)
 
 
+def position(state: State, config: TrainConfig) -> float:
+    """Return a run's place in its schedule."""
+    return config.position(state.seen, state.seconds)
+
+
+def compile_all(state: State) -> None:
+    """Compile the blocks of the backbone, for images and samples of any size."""
+    from torch._dynamo import config as settings
+
+    # All blocks share one piece of code: about seven versions of it, next to the default limit of eight.
+    settings.recompile_limit = 32  # ty: ignore[invalid-assignment]
+    for block in cast(Backbone, state.model.backbone["pretrained"]).blocks:
+        block.compile(dynamic=True)
+
+
 class Trainer:
     """The part of one process in a run; the first process also renders, saves, scores and logs."""
 
     def __init__(self, state: State, pool: Pool, config: TrainConfig, folder: Path, lock):
         self.state, self.pool, self.config, self.folder, self.lock = state, pool, config, folder, lock
         self.device = next(state.model.parameters()).device
-        self.recent: dict[str, float] = {}
-        self.saved_at = time.monotonic()
-        self.recorded = (state.step, state.seen)
+        self.recent: dict[str, torch.Tensor] = {}
+        """Running means on the device; reading them waits for it."""
+        self.broken = torch.zeros((), device=self.device)
+        """Steps of this leg that were left out because a number was not finite."""
+        self.began_at = self.saved_at = time.monotonic()
+        self.rendering_s = 0.0
+        self.recorded = (state.step, state.seen, position(state, config))
 
     def step(self, *, render_new: bool = True) -> None:
         """Draw a batch and update the weights and their average."""
         state, config, cpu_before = self.state, self.config, time.process_time()
         with self.lock:
-            index, seen = state.step, state.seen
+            index = state.step
             state.counters[0] += 1
-        fill(self.pool, index - config.begin[0], render_new=render_new)
+        if config.render_share:
+            self._render_for_a_while()
+        else:
+            fill(self.pool, config, index, render_new=render_new)
+        place = position(state, config)
         generator = torch.Generator().manual_seed(config.seed * 1_000_003 + index)
-        batch = draw_batch(self.pool, config, seen, generator, self.device)
+        batch = draw_batch(self.pool, config, place, generator, self.device)
         terms = objective(state.model, state.read_outs, batch, config, index, generator)
         loss = torch.stack(list(terms.values())).sum()
-        if not torch.isfinite(loss):
+        if not config.broken_steps and not torch.isfinite(loss):
             broken = [name for name, value in terms.items() if not torch.isfinite(value)]
             raise FreeGeoError(f"training step {index}: {', '.join(broken)} not finite. Resume with a lower rate.")
         loss.backward()
-        apply_gradients(state, config)
+        self.broken += ~apply_gradients(state, config.rate(place), config)
         self._remember(terms, batch)
         with self.lock:
             state.counters[1] += batch.views
             state.counters[2] += time.process_time() - cpu_before
 
+    def _render_for_a_while(self) -> None:
+        """Render a shard when rendering has taken less than its share of this leg's time."""
+        now = time.monotonic()
+        if self.rendering_s < self.config.render_share * (now - self.began_at):
+            # Work that is still queued belongs to the steps before.
+            wait_for(self.device)
+            start = time.monotonic()
+            self.pool.grow()
+            wait_for(self.device)
+            self.rendering_s += time.monotonic() - start
+
     def _remember(self, terms: dict[str, torch.Tensor], batch: Batch) -> None:
-        values = {name: float(value.detach()) for name, value in terms.items()}
-        values["zero_motion"] = self.config.weights.rotation * float(zero_motion_rotation(batch))
+        values = terms | {"zero_motion": self.config.weights.rotation * zero_motion_rotation(batch)}
         for name, value in values.items():
-            self.recent[name] = LOG_MEMORY * self.recent.get(name, value) + (1 - LOG_MEMORY) * value
+            value = value.detach().nan_to_num()
+            self.recent[name] = value.lerp(self.recent[name], LOG_MEMORY) if name in self.recent else value
+
+    def read_recent(self) -> dict[str, Any]:
+        """Return the running means of the losses, the rate, the rooms so far and the steps left out, for the log.
+
+        FreeGeoError when more steps were left out than allowed.
+        """
+        broken = int(self.broken)
+        if broken > self.config.broken_steps:
+            raise FreeGeoError(f"{broken} training steps were not finite. Start a new run at a lower rate.")
+        means = zip(self.recent, read(self.recent.values()), strict=True)
+        return {
+            **{name: round(value, 5) for name, value in means},
+            "rate": round(self.config.rate(position(self.state, self.config)), 4),
+            "rooms": self.pool.rooms,
+            "rendering_s": round(self.rendering_s, 1),
+            "broken_steps": broken,
+        }
 
     def keep_record(self) -> None:
         """Save, score and log at their intervals."""
-        state, (step_before, seen_before) = self.state, self.recorded
-        self.recorded = (state.step, state.seen)
-        if seen_before < self.config.cooldown_start <= state.seen:
+        state, (step_before, seen_before, place_before) = self.state, self.recorded
+        place = position(state, self.config)
+        self.recorded = (state.step, state.seen, place)
+        if place_before < self.config.cooldown_start <= place:
             save(state, self.config, self.folder / PLATEAU_FILE)
         if time.monotonic() - self.saved_at > SAVE_EVERY_S:
             save(state, self.config, self.folder / NEWEST_FILE)
             self.saved_at = time.monotonic()
         if state.step // LOG_EVERY_STEPS > step_before // LOG_EVERY_STEPS:
-            self.log("step", {name: round(value, 5) for name, value in self.recent.items()})
-        if state.seen // EVALUATE_EVERY_VIEWS > seen_before // EVALUATE_EVERY_VIEWS:
+            self.log("step", self.read_recent())
+        every = self.config.evaluate_every
+        if every and state.seen // every > seen_before // every:
             scores = score_rooms(averaged(state), "val-id", EVALUATION_ROOMS, side=self.config.side)
             self.log("evaluation", {mode: scores.mean(mode) for mode in scores.per_room})
 
     def log(self, kind: str, values: dict[str, Any]) -> None:
         """Append one line to the run's log."""
         state = self.state
-        counters = {"step": state.step, "views": state.seen, "cpu_s": round(state.cpu_seconds, 1)}
+        counters = {
+            "step": state.step,
+            "views": state.seen,
+            "cpu_s": round(state.cpu_seconds, 1),
+            "s": round(state.seconds, 1),
+        }
         with (self.folder / LOG).open("a", encoding="utf-8") as file:
             file.write(json.dumps({"kind": kind, **counters, **values}) + "\n")
 
 
-def apply_gradients(state: State, config: TrainConfig) -> None:
-    """Clip, step both optimisers at the current rate, and move the running average."""
-    nn.utils.clip_grad_norm_(state.parameters(), config.clip)
-    rate = config.rate(state.seen)
+def wait_for(device: torch.device) -> None:
+    """Wait until a device has done everything that was asked of it."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def read(values: Iterable[torch.Tensor]) -> list[float]:
+    """Read scalars from their device with one copy."""
+    values = list(values)
+    return torch.stack(values).tolist() if values else []
+
+
+def apply_gradients(state: State, rate: float, config: TrainConfig) -> torch.Tensor:
+    """Clip, step both optimisers, and move the running average; return whether all gradients are finite.
+
+    If they are not, they count as zero: the step goes on with the momentum alone, and no weight is spoilt.
+    """
+    parameters = [parameter for parameter in state.parameters() if parameter.grad is not None]
+    usable = nn.utils.clip_grad_norm_(parameters, config.clip).isfinite()
+    if config.broken_steps:
+        zero = torch.zeros((), device=usable.device)
+        for parameter in parameters:
+            parameter.grad = torch.where(usable, cast(torch.Tensor, parameter.grad), zero)
     for optimiser in state.optimisers:
         for group in optimiser.param_groups:
             group["lr"] = group[PLATEAU_LR] * rate
@@ -170,6 +260,7 @@ def apply_gradients(state: State, config: TrainConfig) -> None:
         optimiser.zero_grad(set_to_none=True)
     decay = min(config.ema, (1 + state.step) / (10 + state.step))
     torch._foreach_lerp_(list(state.average.values()), [p.detach() for p in state.model.parameters()], 1 - decay)
+    return usable
 
 
 def keep_settings(config: TrainConfig, folder: Path) -> None:
@@ -190,27 +281,26 @@ def begin(config: TrainConfig, folder: Path, continue_from: Path | None) -> Trai
     if continue_from is not None and not start.is_file():
         if (folder / CONFIG).is_file():
             raise UserError(f"{folder}: holds a run that continues no other. Choose a new folder.")
-        source = continue_from / NEWEST_FILE
-        if not source.is_file():
+        source = next((path for name in (NEWEST_FILE, RESTART_FILE) if (path := continue_from / name).is_file()), None)
+        if source is None:
+            source = continue_from / NEWEST_FILE
             raise UserError(f"{source}: not found, so there is no run to continue. Name the folder of a training run.")
         with atomic_path(start) as part:
             shutil.copyfile(source, part)
     if not start.is_file():
         return config
-    steps, views, _ = torch.load(start, weights_only=True, map_location="cpu", mmap=True)["counters"].tolist()
+    steps, views, *_ = torch.load(start, weights_only=True, map_location="cpu", mmap=True)["counters"].tolist()
     if config.views <= views:
         raise UserError(f"{folder}: the run to continue has seen {views:.0f} views. Ask for more than that.")
     return replace(config, begin=(int(steps), int(views)))
 
 
-def shards_at(step: int) -> int:
-    """Return how many shards of rooms a run's step draws from: one of each aspect at first, then more and more."""
-    return len(ASPECTS) + -(-step // GROW_EVERY_STEPS)
-
-
-def fill(pool: Pool, step: int, *, render_new: bool) -> None:
-    """Load the shards that a run's step draws from; `render_new`: render missing ones."""
-    while len(pool.shards) < shards_at(step) and pool.grow(render_new=render_new):
+def fill(pool: Pool, config: TrainConfig, step: int, *, render_new: bool) -> None:
+    """Load the shards that a step draws from, one of each aspect at least; `render_new`: render missing ones."""
+    wanted = max(len(ASPECTS), -(-config.rooms_at_start // pool.rooms_per_shard))
+    if not config.render_share:
+        wanted += -(-(step - config.begin[0]) // GROW_EVERY_STEPS)
+    while pool.shards < wanted and pool.grow(render_new=render_new):
         pass
 
 
@@ -218,10 +308,14 @@ def open_pool(config: TrainConfig, state: State, folder: Path, device: str) -> P
     """Open the run's rooms with as many as the next step draws from, so that other processes find them."""
     patch = state.model.config.patch_size
     pool = Pool(
-        folder / "rooms", rooms=config.rooms, frames=config.frames, side=config.side, patch=patch,
-        first_room=config.first_room, device=device,
+        folder / "rooms", rooms=config.rooms, rooms_per_shard=config.rooms_per_shard, frames=config.frames,
+        side=config.side, patch=patch, first_room=config.first_room, device=device,
+        domain=replace(get_domain("train"), field_of_view_deg=config.field_of_view_deg),
     )  # fmt: skip
-    fill(pool, state.step - config.begin[0], render_new=True)
+    begun = time.monotonic()
+    fill(pool, config, state.step, render_new=True)
+    wait_for(torch.device(device))
+    logger.info("%d rooms of %d frames ready after %.1f s", pool.rooms, config.frames, time.monotonic() - begun)
     return pool
 
 

@@ -7,15 +7,18 @@ Letters: B samples, S views, P patches, Q cells (2 x 2 a patch), C channels.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import overload
+from typing import cast, overload
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from freegeo.geometry.rotation import quat_xyzw_to_matrix
-from freegeo.models.da3 import DA3
-from freegeo.training.batches import Batch
+from freegeo.geometry import se3
+from freegeo.geometry.rotation import matrix_to_quat_xyzw, quat_xyzw_to_matrix
+from freegeo.models.da3 import DA3, Backbone
+from freegeo.models.dpt import confidence, depth_maps
+from freegeo.models.transformer import first_and_others
+from freegeo.training.batches import Batch, to_device
 from freegeo.training.config import TrainConfig
 from freegeo.types import Features
 
@@ -60,7 +63,8 @@ class CellTargets:
 
 def focal_lengths(fov_vh: Tensor, height: int, width: int) -> Tensor:
     """Return focal lengths in pixels (..., 2), vertical first."""
-    return fov_vh.new_tensor([height, width]) / 2 / torch.tan(fov_vh / 2)
+    vertical, horizontal = torch.tan(fov_vh / 2).unbind(-1)
+    return torch.stack([height / 2 / vertical, width / 2 / horizontal], dim=-1)
 
 
 def cell_targets(batch: Batch, cell: int) -> CellTargets:
@@ -91,8 +95,9 @@ def objective(
     """Return all weighted terms of one step, scalars; their sum is the loss."""
     weights = config.weights
     device_type = batch.images.device.type
+    first_tokens = camera_tokens(model, batch) if config.cameras_given else None
     with torch.autocast(device_type, torch.bfloat16, enabled=device_type == "cuda"):
-        features = model.aggregate(model.embed(batch.images))
+        features = encode(model, batch.images, first_tokens)
     features = as_float32(features)
     terms = camera_terms(model, features, batch, config)
     geometry = geometry_terms(read_outs, features, batch)
@@ -103,13 +108,31 @@ def objective(
     terms["position"] = weights.position * position_term(read_outs, features, batch)
     samples, views = batch.images.shape[:2]
     chosen = Choice(
-        samples=torch.randperm(samples, generator=generator)[: config.depth_views].to(batch.images.device),
+        samples=to_device(torch.randperm(samples, generator=generator)[: config.depth_views], batch.images.device),
         view=int(torch.randint(views, (), generator=generator)),
     )
-    terms |= depth_terms(model, chosen.of(features), chosen.of(batch.depth_z), config)
+    terms |= depth_terms(*read_depth(model, chosen.of(features)), chosen.of(batch.depth_z), config)
     if step % config.ray_branch_every == 0:
         terms["ray_branch"] = weights.ray_branch * ray_branch_term(model, chosen.of(features), batch, chosen)
     return terms
+
+
+def encode(model: DA3, images: Tensor, first_tokens_BSD: Tensor | None) -> Features:
+    """Run the backbone on images (B, S, 3, H, W), whose views start with the given tokens or the learned ones."""
+    tokens = model.embed(images)
+    backbone = cast(Backbone, model.backbone["pretrained"])
+    levels = backbone.aggregate(tokens, model.config.out_layers, None, first_tokens_BSD)
+    return Features(levels=levels, image_hw=tokens.image_hw, grid_hw=tokens.grid_hw)
+
+
+def camera_tokens(model: DA3, batch: Batch) -> Tensor:
+    """Return the first tokens (B, S, D): encoded cameras where a sample's cameras are given, else the learned ones."""
+    T_world_cam = se3.inverse(se3.normalise_poses(se3.inverse(batch.T_world_cam)))
+    quat = matrix_to_quat_xyzw(T_world_cam[..., :3, :3])
+    encoded = model.cam_enc(torch.cat([T_world_cam[..., :3, 3], quat, batch.fov_vh], dim=-1))
+    backbone = cast(Backbone, model.backbone["pretrained"])
+    learned = first_and_others(backbone.camera_token, *batch.images.shape[:2])
+    return torch.where(batch.cameras_given[:, None, None], encoded, learned)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,50 +224,59 @@ def cell_depth_term(read_outs: ReadOuts, features: Features, batch: Batch) -> Te
     return (log_depth - batch.depth_z[..., middle::cell, middle::cell].log()).abs().mean()
 
 
-def given(part: Tensor | None) -> Tensor:
-    """Return a part of a prediction that must not be None."""
-    assert part is not None
-    return part
+def pyramid(model: DA3, features: Features) -> list[Tensor]:
+    """Return the dense head's maps of all views at once; `decode` reads a few at a time, which keeps a GPU waiting."""
+    levels = [features.levels[i][0].flatten(0, 1) for i in model.config.out_layers]
+    return model.head.pyramid(levels, features.grid_hw)
 
 
-def depth_terms(model: DA3, features: Features, depth_true: Tensor, config: TrainConfig) -> dict[str, Tensor]:
+def read_depth(model: DA3, features: Features) -> tuple[Tensor, Tensor]:
+    """Return depth and confidence (B, 1, H, W) of features of one view each."""
+    maps = depth_maps(model.head.dense(pyramid(model, features), features.grid_hw))
+    return maps["depth_z"][:, None], maps["conf"][:, None]
+
+
+def depth_terms(depth_z: Tensor, conf: Tensor, depth_true: Tensor, config: TrainConfig) -> dict[str, Tensor]:
     """Compare log depth and its gradients; confidence learns the depth error, which is detached."""
-    prediction = model.decode(features, want=("depth",))
-    depth_z, conf = given(prediction.depth_z), given(prediction.conf)
     difference = depth_z.log() - depth_true.log()
     error = difference.abs()
     gradient = difference.diff(dim=-1).abs().mean() + difference.diff(dim=-2).abs().mean()
-    confidence = conf * error.detach() - CONFIDENCE_TARGET * conf.log()
     return {
         "depth": config.weights.depth * error.mean(),
         "gradient": config.weights.gradient * gradient,
-        "confidence": 0.1 * confidence.mean(),
+        "confidence": 0.1 * confidence_loss(conf, error),
     }
+
+
+def confidence_loss(conf: Tensor, error: Tensor) -> Tensor:
+    """Return the mean loss of a confidence that learns an error, which gets no gradient from it."""
+    return (conf * error.detach() - CONFIDENCE_TARGET * conf.log()).mean()
 
 
 def ray_branch_term(model: DA3, features: Features, batch: Batch, chosen: Choice) -> Tensor:
     """Train the ray branch of the dense head on detached features."""
     detached = replace(features, levels={i: (p.detach(), s.detach()) for i, (p, s) in features.levels.items()})
-    rays = given(model.decode(detached, want=("rays",)).rays)
+    maps = model.head.rays(pyramid(model, detached), features.grid_hw).permute(0, 2, 3, 1)[:, None]
+    rays, raw_confidence = maps[..., :6], maps[..., 6]
     patch = batch.images.shape[-1] // features.grid_hw[1]
     direction = chosen.of(cell_targets(batch, patch // RAYS_PER_PATCH_SIDE).direction)
     origin = chosen.of(batch.T_world_cam)[..., None, None, :3, 3].expand_as(direction)
-    error = (rays[..., :6] - torch.cat([direction, origin], dim=-1)).abs().mean(-1)
-    confidence = rays[..., 6] * error.detach() - CONFIDENCE_TARGET * rays[..., 6].log()
-    return error.mean() + 0.1 * confidence.mean()
+    error = (rays - torch.cat([direction, origin], dim=-1)).abs().mean(-1)
+    return error.mean() + 0.1 * confidence_loss(confidence(raw_confidence), error)
 
 
 def matching_term(read_outs: ReadOuts, features: Features, batch: Batch) -> Tensor:
     """Match each patch with its partner in another view (InfoNCE); hidden and outside points are left out."""
     views, device = batch.images.shape[1], batch.images.device
-    pairs = sorted({(0, j) for j in range(1, views)} | {(j - 1, j) for j in range(1, views)})
-    first, second = (torch.tensor(side, device=device) for side in zip(*pairs, strict=True))
+    # View 0 with all others, then the other neighbours.
+    later = torch.arange(1, views, device=device)
+    first, second = torch.cat([torch.zeros_like(later), later[:-1]]), torch.cat([later, later[1:]])
     target, visible = partners(batch, features.grid_hw, first, second)
     levels = sorted(features.levels)
     losses = []
     for index, read_out in zip(MATCH_LEVELS, read_outs.descriptors, strict=True):
         descriptor = F.normalize(read_out(features.levels[levels[index]][0]), dim=-1)
-        logits = descriptor[:, first] @ descriptor[:, second].mT / MATCH_TEMPERATURE
+        logits = descriptor.index_select(1, first) @ descriptor.index_select(1, second).mT / MATCH_TEMPERATURE
         losses.append(F.cross_entropy(logits.flatten(0, 2), target.flatten(), reduction="none"))
     return (torch.stack(losses).mean(0) * visible.flatten()).sum() / visible.sum().clamp_min(1)
 
@@ -253,8 +285,9 @@ def position_term(read_outs: ReadOuts, features: Features, batch: Batch) -> Tens
     """Predict for each patch of the other views where the first view sees its point, in image widths and heights."""
     second = torch.arange(1, batch.images.shape[1], device=batch.images.device)
     seen = sightings(batch, features.grid_hw, second, torch.zeros_like(second))
-    size = batch.fov_vh.new_tensor(batch.depth_z.shape[-2:])
-    target, visible = seen.row_column / size - 0.5, seen.visible[..., None]
+    height, width = batch.depth_z.shape[-2:]
+    row, column = seen.row_column.unbind(-1)
+    target, visible = torch.stack([row / height, column / width], dim=-1) - 0.5, seen.visible[..., None]
     levels = sorted(features.levels)
     errors = [
         (read_out(features.levels[levels[index]][0][:, 1:]) - target).abs()

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from freegeo.data.procedural import get_domain
 from freegeo.files import write_json
@@ -23,7 +24,6 @@ from freegeo.metrics.cloud import f1_rel5
 from freegeo.metrics.depth import score_depth
 from freegeo.metrics.pose import pair_errors, pose_auc
 from freegeo.models.api import ReconstructionModel
-from freegeo.training.objective import given
 from freegeo.training.pool import Rooms, image_size, render_rooms
 from freegeo.types import Prediction
 
@@ -106,6 +106,12 @@ def predictions(model: ReconstructionModel, batch: Rooms) -> Iterator[tuple[str,
     yield "4", KEPT, model.decode(model.aggregate(tokens.select(KEPT)))
     yield "8->4", KEPT, model.decode(all_features.select(KEPT))
     yield "8", every, model.decode(all_features)
+
+
+def given(part: Tensor | None) -> Tensor:
+    """Return a part of a prediction that must not be None."""
+    assert part is not None
+    return part
 
 
 def score_room(

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+import json
 import logging
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from freegeo.files import atomic_path
-from freegeo.models.catalog import EMBEDDED_MODEL, build_empty
+from freegeo.models.catalog import EMBEDDED_MODEL
+from freegeo.models.checkpoints import build_on_meta, find_file, load_weights
 from freegeo.models.da3 import DA3, Backbone
-from freegeo.models.da3_config import KEYS
+from freegeo.models.da3_config import KEYS, build, embedded_spec
 from freegeo.models.transformer import Block, initialise
-from freegeo.training.config import TrainConfig
+from freegeo.training.config import SHAPES, TrainConfig
 from freegeo.training.muon import Muon
 from freegeo.training.objective import ReadOuts
 
 logger = logging.getLogger(__name__)
 
-NEWEST_FILE, PLATEAU_FILE, START_FILE = "state.pt", "plateau.pt", "start.pt"
-"""Newest state; state before the cool-down; state of the run that this one continues."""
+NEWEST_FILE, PLATEAU_FILE, START_FILE, RESTART_FILE = "state.pt", "plateau.pt", "start.pt", "restart.pt"
+"""Newest state; state before the cool-down; state of the run that this one continues; the newest weights alone in half
+precision, for a run that continues this one on another machine."""
 FIRST_FOV_RAD = 1.0
 MUON_PARTS = ("backbone.pretrained.blocks.", "cam_dec.backbone.")
 PLATEAU_LR = "plateau_lr"
@@ -38,7 +44,8 @@ class State:
     average: dict[str, Tensor]
     optimisers: tuple[Muon, torch.optim.AdamW]
     counters: Tensor
-    """(3,) float64: steps begun, views learned from, seconds of processor time; on the CPU."""
+    """(4,) float64: steps begun, views learned from, seconds of processor time, seconds since the run began; on the
+    CPU."""
 
     @property
     def step(self) -> int:
@@ -55,6 +62,11 @@ class State:
         """Processor time of all workers."""
         return float(self.counters[2])
 
+    @property
+    def seconds(self) -> float:
+        """Time that the run has taken, all legs together."""
+        return float(self.counters[3])
+
     def parameters(self) -> list[nn.Parameter]:
         """Return all parameters that learn."""
         return [*self.model.parameters(), *self.read_outs.parameters()]
@@ -70,14 +82,15 @@ class State:
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Load the values that `tensors` returned."""
+        """Load the values that `tensors` returned; without an average and optimisers these start anew."""
         self.model.load_state_dict(saved["model"])
         self.read_outs.load_state_dict(saved["read_outs"])
-        for name, value in saved["average"].items():
-            self.average[name].copy_(value)
-        for optimiser, values in zip(self.optimisers, saved["optimisers"], strict=True):
-            optimiser.load_state_dict(values)
-        self.counters.copy_(saved["counters"])
+        for name, value in saved.get("average", dict(self.model.named_parameters())).items():
+            self.average[name].copy_(value.detach())
+        if "optimisers" in saved:
+            for optimiser, values in zip(self.optimisers, saved["optimisers"], strict=True):
+                optimiser.load_state_dict(values)
+        self.counters[: len(saved["counters"])] = saved["counters"]
 
     def share(self) -> None:
         """Move all numbers to memory that other processes can write to as well."""
@@ -94,7 +107,7 @@ class State:
 def new_state(config: TrainConfig, device: torch.device | str = "cpu") -> State:
     """Build model, training-only read-outs and optimisers from the seed."""
     generator = torch.Generator().manual_seed(config.seed)
-    model = cast(DA3, build_empty(EMBEDDED_MODEL).to_empty(device="cpu"))
+    model = build_shape(config.shape).to_empty(device="cpu")
     reset_norms(model)
     initialise(model, generator)
     seek_alike(model)
@@ -104,7 +117,12 @@ def new_state(config: TrainConfig, device: torch.device | str = "cpu") -> State:
     model, read_outs = model.to(device), read_outs.to(device)
     average = {name: value.detach().clone() for name, value in model.named_parameters()}
     optimisers = build_optimisers(model, read_outs, config)
-    return State(model, read_outs, average, optimisers, torch.zeros(3, dtype=torch.float64))
+    return State(model, read_outs, average, optimisers, torch.zeros(4, dtype=torch.float64))
+
+
+def build_shape(shape: str) -> DA3:
+    """Build one of `SHAPES` on the meta device."""
+    return build_on_meta(partial(build, SHAPES[shape], embedded_spec(SHAPES[shape])))
 
 
 def reset_norms(model: nn.Module) -> None:
@@ -158,9 +176,26 @@ def build_optimisers(model: DA3, read_outs: ReadOuts, config: TrainConfig) -> tu
     return muon, adamw
 
 
+def trained_model(checkpoint: Path) -> DA3:
+    """Load weights of the embedded model in the shape that their run trained; UserError if they do not fit."""
+    path = find_file(checkpoint)
+    model = build_shape(trained_shape(path))
+    load_weights(model, path, KEYS, EMBEDDED_MODEL)
+    return model.eval()
+
+
+def trained_shape(path: Path) -> str:
+    """Return the name in `SHAPES` that a run left in its weight file; files of other origin have the shipped shape."""
+    shape = None
+    if path.suffix == ".safetensors":
+        with suppress(SafetensorError), safe_open(path, "pt") as file:  # `load_weights` says what is wrong with a file
+            shape = json.loads((file.metadata() or {}).get("config", "{}")).get("shape")
+    return shape if shape in SHAPES else TrainConfig().shape
+
+
 def averaged(state: State) -> DA3:
     """Return a model of its own with the averaged weights, on the CPU."""
-    model = cast(DA3, build_empty(EMBEDDED_MODEL))
+    model = build_on_meta(partial(build, state.model.config, state.model.spec))
     aliases = {alias: state.average[stored] for alias, stored in KEYS.aliases.items()}
     weights = state.model.state_dict() | state.average | aliases
     model.load_state_dict({name: value.cpu().clone() for name, value in weights.items()}, assign=True)
@@ -174,10 +209,14 @@ def resume(state: State, config: TrainConfig, folder: Path) -> None:
         if not path.is_file():
             continue
         saved = torch.load(path, weights_only=True, map_location=next(state.model.parameters()).device)
-        cooling = name == NEWEST_FILE and saved["counters"][1] > saved["cooldown_start"]
-        if cooling and saved["cooldown_start"] < config.cooldown_start:
-            continue
+        if name == NEWEST_FILE:
+            counters = [*saved["counters"].tolist(), 0.0]  # older states have no time
+            cooling = config.position(int(counters[1]), counters[3]) > saved["cooldown_start"]
+            if cooling and saved["cooldown_start"] < config.cooldown_start:
+                continue
         state.restore(saved)
+        if name == START_FILE:
+            state.counters[3] = 0.0
         logger.info("resumed %s at %d views", path, state.seen)
         return
 
@@ -186,3 +225,11 @@ def save(state: State, config: TrainConfig, path: Path) -> None:
     """Write the whole state atomically."""
     with atomic_path(path) as part:
         torch.save({**state.tensors(), "cooldown_start": config.cooldown_start}, part)
+
+
+def save_restart(state: State, path: Path) -> None:
+    """Write the weights without average and optimisers in half precision, about a tenth of the whole state."""
+    parts = {"model": state.model.state_dict(), "read_outs": state.read_outs.state_dict()}
+    halves = {part: {name: value.half().cpu() for name, value in values.items()} for part, values in parts.items()}
+    with atomic_path(path) as temporary:
+        torch.save({**halves, "counters": state.counters}, temporary)
