@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import shutil
 import time
 from collections.abc import Callable
@@ -119,21 +120,22 @@ class Trainer:
         generator = torch.Generator().manual_seed(config.seed * 1_000_003 + index)
         batch = draw_batch(self.pool, config, seen, generator, self.device)
         terms = objective(state.model, state.read_outs, batch, config, index, generator)
-        loss = torch.stack(list(terms.values())).sum()
-        if not torch.isfinite(loss):
-            broken = [name for name, value in terms.items() if not torch.isfinite(value)]
+        losses = torch.stack(list(terms.values()))
+        losses.sum().backward()
+        # One transfer a step: every further one would let an accelerator run dry.
+        values = dict(zip(terms, losses.tolist(), strict=True))
+        broken = [name for name, value in values.items() if not math.isfinite(value)]
+        if broken:
             raise FreeGeoError(f"training step {index}: {', '.join(broken)} not finite. Resume with a lower rate.")
-        loss.backward()
         apply_gradients(state, config)
-        self._remember(terms, batch)
+        self._remember(values, batch)
         with self.lock:
             state.counters[1] += batch.views
             state.counters[2] += time.process_time() - cpu_before
 
-    def _remember(self, terms: dict[str, torch.Tensor], batch: Batch) -> None:
-        values = {name: float(value.detach()) for name, value in terms.items()}
-        values["zero_motion"] = self.config.weights.rotation * float(zero_motion_rotation(batch))
-        for name, value in values.items():
+    def _remember(self, values: dict[str, float], batch: Batch) -> None:
+        still = self.config.weights.rotation * float(zero_motion_rotation(batch))
+        for name, value in {**values, "zero_motion": still}.items():
             self.recent[name] = LOG_MEMORY * self.recent.get(name, value) + (1 - LOG_MEMORY) * value
 
     def keep_record(self) -> None:
