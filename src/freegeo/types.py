@@ -119,9 +119,8 @@ class ViewTokens:
 
     def select(self, views: Sequence[int]) -> Self:
         """Return the chosen views, in the order given."""
-        index = torch.as_tensor(list(views), dtype=torch.long, device=self.tokens.device)
-        extra = {name: value.index_select(1, index) for name, value in self.extra.items()}
-        return replace(self, tokens=self.tokens.index_select(1, index), extra=extra)
+        extra = {name: _views(value, views) for name, value in self.extra.items()}
+        return replace(self, tokens=_views(self.tokens, views), extra=extra)
 
     @classmethod
     def join_views(cls, parts: Sequence[ViewTokens]) -> ViewTokens:
@@ -159,7 +158,7 @@ class Features:
 
     def select(self, views: Sequence[int]) -> Self:
         """Return the chosen views, in the order given ("8->4" is `select([0, 2, 4, 6])`)."""
-        return self._map(lambda t: t.index_select(1, torch.as_tensor(list(views), dtype=torch.long, device=t.device)))
+        return self._map(lambda t: _views(t, views))
 
     def to(self, *args, **kwargs) -> Self:
         """Move or cast all tensors, with the arguments of `Tensor.to`."""
@@ -182,6 +181,11 @@ class Features:
         layers = sorted(int(k.removesuffix(".patch")) for k in tensors if k.endswith(".patch"))
         levels = {i: (tensors[f"{i}.patch"], tensors[f"{i}.special"]) for i in layers}
         return cls(levels=levels, **_read_meta(tensors))
+
+
+def _views(tensor: Tensor, views: Sequence[int]) -> Tensor:
+    """Return chosen views of a tensor (B, S, ...); without positions on the device, for which an accelerator waits."""
+    return torch.stack([tensor[:, view] for view in views], dim=1)
 
 
 def _meta_tensors(value: ViewTokens | Features) -> dict[str, Tensor]:

@@ -2,10 +2,15 @@
 
 import pytest
 import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
+from freegeo.adaptation.losses import adaptation_loss, draw_tokens, held_out_tokens
+from freegeo.adaptation.recipe import scene
 from freegeo.errors import UserError
 from freegeo.models.precision import PRECISIONS, Compute
-from tiny_models import noise, tiny_da3
+from tiny_models import noise, tiny_da3, tiny_vggt, trained
 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
@@ -87,3 +92,96 @@ def test_fp32_on_a_gpu_is_computed_without_tf32_and_leaves_the_settings_as_they_
     assert [each.fp32_precision for each in settings] == before
     with Compute().autocast():
         assert [each.fp32_precision for each in settings] == before
+
+
+HALF = {torch.bfloat16, torch.float16}
+PRODUCTS = {"mm", "addmm", "bmm", "baddbmm", "convolution"}
+
+
+def model_loss(model):
+    """The loss of the recipe `scene`."""
+    return scene(model.spec).loss
+
+
+class Recorder(TorchDispatchMode):
+    """Which floating types every operation reads and gives, by its name."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen: dict[str, set[torch.dtype]] = {}
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        name = func.name().removeprefix("aten::").partition(".")[0]
+        found = {leaf.dtype for leaf in tree_leaves((args, kwargs, result)) if isinstance(leaf, Tensor)}
+        self.seen.setdefault(name, set()).update(dtype for dtype in found if dtype.is_floating_point)
+        return result
+
+    def of_products(self) -> set[torch.dtype]:
+        """Types of all matrix products and convolutions."""
+        return set().union(*(types for name, types in self.seen.items() if name in PRODUCTS))
+
+    def everything(self) -> set[torch.dtype]:
+        """Types of all operations."""
+        return set().union(*self.seen.values())
+
+
+@pytest.mark.parametrize("precision", ["bf16", "fp16"])
+@pytest.mark.parametrize("make", [tiny_da3, tiny_vggt])
+def test_half_precision_stays_in_the_products_of_embed_and_aggregate(make, precision):
+    model, compute, half = make(), Compute(precision=precision), DTYPES[precision]
+    adapter = trained(model)
+    images, kept = noise(4)[None], (0, 2)
+    with compute.autocast():
+        with Recorder() as embedding:
+            tokens = model.embed(images)
+        with Recorder() as aggregating:
+            student = model.aggregate(tokens.select(kept))
+        with torch.no_grad(), adapter.off():
+            teacher = model.aggregate(tokens)
+    assert embedding.of_products() == aggregating.of_products() == {half}
+    attention = [types for name, types in aggregating.seen.items() if "attention" in name]
+    assert attention
+    # Besides its half inputs and output, attention gives the logarithms of its softmax's sums, in float32.
+    assert all(types <= {half, torch.float32} for types in attention)
+    streams = [tokens.tokens, *(tensor for level in student.levels.values() for tensor in level)]
+    assert {tensor.dtype for tensor in streams} == {torch.float32}
+    with torch.no_grad(), compute.autocast(), Recorder() as decoding:
+        model.decode(teacher)
+    assert decoding.everything() == {torch.float32}
+
+    config, last = model_loss(model), max(teacher.levels)
+    with Recorder() as losing:
+        loss, _ = adaptation_loss(
+            student.levels, teacher.select(kept).levels, held_out_tokens(teacher.levels[last], kept, config),
+            draw_tokens(config, tokens_per_view=16, student_views=2, held_out_views=2, generator=torch.Generator()),
+            config,
+        )  # fmt: skip
+    assert losing.everything() == {torch.float32, torch.float64}
+    loss.backward()
+    assert {value.dtype for p in adapter.parameters() for value in (p, p.grad)} == {torch.float32}
+
+
+def test_losses_of_half_features_are_computed_in_float32():
+    config = model_loss(tiny_da3())
+    generator = torch.Generator().manual_seed(0)
+    patch, other = (torch.randn(1, 2, 16, 32, generator=generator).bfloat16() for _ in range(2))
+    special = patch[:, :, :1]
+    draws = draw_tokens(config, tokens_per_view=16, student_views=2, held_out_views=2, generator=generator)
+    with Recorder() as losing:
+        loss, terms = adaptation_loss(
+            {0: (patch.requires_grad_(), special)}, {0: (other, special)}, other.flatten(1, 2), draws, config
+        )
+    assert losing.of_products() <= {torch.float32, torch.float64}
+    assert {loss.dtype, *(term.dtype for term in terms.values())} == {torch.float32}
+
+
+@torch.no_grad()
+def test_the_reference_view_is_chosen_in_float32():
+    """Views are so alike that half precision would choose another one in every second scene."""
+    model = tiny_da3()
+    tokens = model.embed(noise(6)[None])
+    expected = model.view_order(tokens, "saddle_balanced")
+    with Compute(precision="bf16").autocast(), Recorder() as choosing:
+        assert torch.equal(model.view_order(tokens, "saddle_balanced"), expected)
+    assert choosing.everything() == {torch.float32}

@@ -120,7 +120,7 @@ def co_visible(candidate: Candidate, usable: Tensor | None = None) -> CoVisible:
     return CoVisible(
         pixel=grid,
         seen=everything,
-        share=(everything.sum(-1) / possible[:, None]).double().cpu().numpy(),
+        share=(everything.sum(-1) / possible[:, None]).cpu().double().numpy(),
         tolerance=tolerance,
     )
 
@@ -144,7 +144,7 @@ def depth_agreement(candidate: Candidate, fixed: CoVisible) -> DepthAgreement:
         count = seen.sum(-1)
         share.append((confirmed & seen).sum(-1) / count)
         log_ratio.append((clipped * seen).sum(-1) / count)
-    values = torch.stack((torch.stack(share), torch.stack(log_ratio))).double().cpu().numpy()[:, *pairs.T]
+    values = torch.stack((torch.stack(share), torch.stack(log_ratio))).cpu().double().numpy()[:, *pairs.T]
     return DepthAgreement(
         pairs=pairs, share=values[0], log_ratio=values[1], reason=None if len(pairs) else _NOTHING_SHARED
     )

@@ -40,13 +40,13 @@ class TsdfVolume:
         Args:
             voxel: voxel edge in metres.
             truncation: distance in metres at which the signed distance is cut.
-            device: of the volume and of the integration.
+            device: of the volume and of the integration; for Apple's GPUs, which have no float64, the CPU is taken.
         """
         if not (voxel > 0 and truncation > 0):
             raise UserError(f"Voxel edge and truncation must be positive, not {voxel} and {truncation}.")
         self.voxel = float(voxel)
         self.truncation = float(truncation)
-        self.device = torch.device(device)
+        self.device = torch.device("cpu" if torch.device(device).type == "mps" else device)
         self.block_edge = BLOCK * self.voxel
         self._keys = torch.empty(0, dtype=torch.int64, device=self.device)  # sorted
         self._rows = torch.empty(0, dtype=torch.int64, device=self.device)  # storage row of each key

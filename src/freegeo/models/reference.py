@@ -68,7 +68,9 @@ def view_order(token_BSD: Tensor, rule: str) -> Tensor | None:
     views = token_BSD.shape[1]
     if rule == "first" or views < SMALLEST_SELECTION:
         return None
-    chosen_B1 = RULES[rule](token_BSD.float())[:, None]
+    # Views are alike to the third digit, which a half type would round away.
+    with torch.autocast(token_BSD.device.type, enabled=False):
+        chosen_B1 = RULES[rule](token_BSD.float())[:, None]
     # A stable sort by "is not the chosen one" keeps the others in input order.
     return (torch.arange(views, device=token_BSD.device) != chosen_B1).to(torch.uint8).argsort(dim=1, stable=True)
 

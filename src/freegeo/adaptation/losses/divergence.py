@@ -26,7 +26,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from freegeo.adaptation.losses.numerics import block_elements, blocks, exact_matmul, widened
+from freegeo.adaptation.losses.numerics import block_elements, blocks, doubled, exact_matmul, widened
 
 KLForm = Literal["float32", "float64", "direct"]
 """How all-pairs KL is evaluated: matrix products in float32 or in float64, or the definition pair by pair."""
@@ -162,7 +162,7 @@ def all_pairs_divergence(
         return _transposed(student, teacher, temperature=temperature, form=form)
     x, y = map(widened, student)
     teacher_x, teacher_y = (widened(tensor).detach() for tensor in teacher)
-    wide = x.dtype
+    device, wide = x.device, x.dtype
     with torch.no_grad():
         if form is None:
             spreads = [pair_spread(x, y, temperature), pair_spread(teacher_x, teacher_y, temperature)]
@@ -172,13 +172,13 @@ def all_pairs_divergence(
         common = teacher_common if same_x else _mean_token(x, y)
     if form == "float64":
         x, y, teacher_x, teacher_y, common, teacher_common = (
-            tensor.double() for tensor in (x, y, teacher_x, teacher_y, common, teacher_common)
+            doubled(tensor) for tensor in (x, y, teacher_x, teacher_y, common, teacher_common)
         )
     x, y = _centred(x, y, common, temperature)
     teacher_x, teacher_y = _centred(teacher_x, teacher_y, teacher_common, temperature)
     if form == "direct":
         return _DirectPairs.apply(x, y, teacher_x, teacher_y)
-    return _ProductPairs.apply(x, y, teacher_x, teacher_y, same_x).to(wide)
+    return _ProductPairs.apply(x, y, teacher_x, teacher_y, same_x).to(device, wide)
 
 
 def _transposed(

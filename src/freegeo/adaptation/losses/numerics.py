@@ -46,6 +46,12 @@ def doubled(tensor: Tensor) -> Tensor:
     return tensor.cpu().double() if tensor.device.type == "mps" else tensor.double()
 
 
+def sent(tensor: Tensor, device: torch.device | str) -> Tensor:
+    """`tensor` of the CPU on a device; CUDA takes it without waiting for the work that is queued there."""
+    # CUDA has copied pageable memory when the call returns. Apple's GPUs may read it later, so they wait.
+    return tensor.to(device, non_blocking=torch.device(device).type == "cuda")
+
+
 @contextmanager
 def exact_matmul(tensor: Tensor) -> Generator[None]:
     """Matrix products on the device of `tensor` in the full precision of their inputs: no autocast, no TF32.

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from freegeo.adaptation.losses.numerics import blocks, exact_matmul, widened
+from freegeo.adaptation.losses.numerics import blocks, exact_matmul, sent, widened
 from freegeo.adaptation.recipe import LossConfig, Selection
 from freegeo.errors import UserError
 
@@ -49,7 +49,7 @@ def held_out_tokens(level: Level, kept: Sequence[int], config: LossConfig, *, pa
 
 def positions_of(mask: Tensor, device: torch.device) -> Tensor:
     """Flat positions (n,) of the true values of a mask on the CPU."""
-    return mask.flatten().nonzero()[:, 0].to(device)
+    return sent(mask.flatten().nonzero()[:, 0], device)
 
 
 def _cross_mask(patches: Tensor, tokens_per_view: int) -> Tensor:
@@ -72,8 +72,8 @@ class TokenDraw:
 
     def to(self, device: torch.device | str) -> "TokenDraw":
         """The same draw on another device."""
-        anchor = None if self.anchor is None else self.anchor.to(device)
-        return replace(self, reference=self.reference.to(device), query=self.query.to(device), anchor=anchor)
+        anchor = None if self.anchor is None else sent(self.anchor, device)
+        return replace(self, reference=sent(self.reference, device), query=sent(self.query, device), anchor=anchor)
 
 
 @dataclass(frozen=True, kw_only=True)
