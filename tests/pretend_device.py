@@ -26,6 +26,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from freegeo.data.procedural import raytrace
+from freegeo.models import images
 from freegeo.models.dpt import uv_embedding
 from freegeo.models.transformer import grid_rope
 
@@ -81,6 +82,7 @@ class PretendDevice:
         yield torch.cuda, "device_count", lambda: 1
         yield torch.cuda, "get_rng_state", lambda device=None: torch.get_rng_state()
         yield torch.cuda, "set_rng_state", lambda state, device=None: None
+        yield torch.cuda, "synchronize", lambda device=None: self.waited("all work")
         yield torch.cuda, "manual_seed_all", lambda seed: None
         yield torch.cuda, "mem_get_info", lambda device=None: (16 << 30, 16 << 30)
         yield torch.cuda, "memory_reserved", lambda device=None: 0
@@ -141,8 +143,8 @@ class PretendDevice:
 
 def forget_tables() -> None:
     """Empty the models' caches of tables, which are on a device."""
-    grid_rope.cache_clear()
-    uv_embedding.cache_clear()
+    for kept in (grid_rope, uv_embedding, images._statistics):
+        kept.cache_clear()
 
 
 class _Dispatch(TorchDispatchMode):
