@@ -175,7 +175,7 @@ class RecipeOptions:
     rank: int | None = None
     """Size of the adapter: rank of its matrices. Default: 32 (freegeo-tiny: 16)."""
     hold: float | None = None
-    """How strongly the answer from all photos is held where it was. Default: 0; try 1 where many photos get worse."""
+    """How strongly the answer from all photos is held where it was. Default: 1 with recipe scene, else 0."""
     loss: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     """Settings of the loss, such as weight_kq=0 or selection=topk,angle_weights=2,2,2; may be given several times."""
 
