@@ -11,9 +11,10 @@ ANYWHERE = {"types", "errors", "files", "run_folder", "__init__"}
 ALLOWED = {
     "pipeline": {
         *("models", "data", "adaptation", "evidence", "fusion", "export", "report", "metrics", "geometry", "progress"),
-        "guarded",
+        *("guarded", "refined"),
     },
     "guarded": {"adaptation", "evidence", "export"},
+    "refined": {"evidence", "export", "fusion", "guarded"},
     "progress": {"adaptation"},
     "benchmark": {"adaptation", "models", "data", "fusion", "metrics", "geometry"},
     "training": {"models", "data", "metrics", "geometry"},

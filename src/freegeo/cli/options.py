@@ -19,6 +19,8 @@ from freegeo.errors import UserError
 from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL, entry, warn_of_embedded_model
 from freegeo.models.spec import MIXED, Mixed
 
+Refine = Literal["off", "ba"]
+"""What follows a prediction: nothing, or bundle adjustment of matches between the photos (docs/refinement.md)."""
 SMALL_MODEL = 20_000_000
 """Parameters below which a model runs on one CPU thread."""
 
@@ -141,6 +143,14 @@ def model_of_adapter(adapter: Path, model: str | None) -> str:
             f"{adapter}: the adapter was made for {made_for}, not for {entry(model).name}. Leave --model out."
         )
     return made_for
+
+
+def require_refinement(refine: Refine) -> None:
+    """Raise UserError when what a refinement needs is not installed; called before anything slow."""
+    if refine == "ba":
+        from freegeo.evidence.bundle import pycolmap_module
+
+        pycolmap_module()
 
 
 def use_few_threads(model: ReconstructionModel) -> None:
