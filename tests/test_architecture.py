@@ -20,7 +20,7 @@ ALLOWED = {
     "training": {"models", "data", "metrics", "geometry"},
     "adaptation": {"models", "data.scene", "geometry"},
     "evidence": {"export", "fusion", "metrics", "geometry"},
-    "report": {"export", "metrics", "geometry"},
+    "report": {"evidence", "export", "metrics", "geometry"},
     "export": {"fusion", "geometry"},
     "fusion": {"geometry"},
     "metrics": {"data.scene", "geometry"},

@@ -452,7 +452,7 @@ class Job:
         write_json(self.folder / SUMMARY_NAME, summary)
         self.after(self)
         self.hooks.stage("report")
-        write_report(self.folder.path)
+        write_report(self.folder.path, photos=self.photos)
         self.folder.finish()
         return summary
 

@@ -27,8 +27,10 @@ class Refined:
     tracks: Tracks | None
     """Points that were measured in the photos, in the result's frame; None where the refinement is refused."""
     about: dict[str, Any]
-    """JSON-like: `accepted`, `reason` (a sentence), `probability`, `pairs`, and scores `frozen`, `before`, `after` as
-    `Measurement.as_dict`. The epipolar error of `after` is that of pairs that had no part in the adjustment."""
+    """JSON-like: `accepted`, `reason` (a sentence), `lacking` (what a refused one lacks: `matches` to begin with, a
+    `fit` of matches and prediction, or `proof` by held-out pairs), `probability`, `pairs`, and scores `frozen`,
+    `before`, `after` as `Measurement.as_dict`. The epipolar error of `after` is that of pairs that had no part in the
+    adjustment."""
 
 
 def refine_by_photos(
@@ -78,7 +80,14 @@ def _about(found: Refinement, scores: dict[str, Any]) -> dict[str, Any]:
     return {
         "accepted": found.accepted,
         "reason": found.reason,
+        "lacking": None if found.accepted else _lacking(found),
         "probability": found.probability,
         "pairs": 0 if found.pairs is None else len(found.pairs),
         "frozen": None, "before": None, "after": None, **scores,
     }  # fmt: skip
+
+
+def _lacking(found: Refinement) -> str:
+    if found.after_px is not None:
+        return "proof"
+    return "matches" if found.T_cam_world is None else "fit"

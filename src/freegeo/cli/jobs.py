@@ -154,13 +154,29 @@ def say_finished(folder: Path, finished_at: str | None) -> None:
     console.say(f"{folder}: already finished on {finished_at}; nothing to do.")
 
 
+def say_answer(summary: dict[str, Any]) -> None:
+    """Print whether adaptation and refinement helped, the scores of that, and what to try where they did not."""
+    from freegeo.report.answer import HEADER, answer
+
+    found = answer(summary)
+    if found is None:
+        return
+    console.say("\nDid it help?")
+    for part in found.parts:
+        console.say(f"{part.what}: {part.outcome}. {part.sentence}")
+    if found.rows:
+        console.say(console.table(HEADER, found.rows))
+    if found.advice:
+        console.say("What to try next:")
+        for sentence in found.advice:
+            console.say(f"  {sentence}")
+    console.say()
+
+
 def describe(summary: dict[str, Any], folder: Path) -> None:
     """Print the outcome of a job."""
+    say_answer(summary)
     console.say(f"{len(summary['images'])} views at {summary['image_hw'][1]} x {summary['image_hw'][0]} pixels")
-    if summary["verdict"]:
-        console.say(summary["verdict"]["reason"])
-    if summary["refinement"]:
-        console.say(summary["refinement"]["reason"])
     if summary["loss"]:
         first, last = summary["loss"]["first"], summary["loss"]["last"]
         console.say(f"adaptation loss {first:.4f} -> {last:.4f} (means of the first and last tenth of the steps)")

@@ -8,7 +8,7 @@ from typing import Annotated
 from freegeo.cli import console
 from freegeo.cli.export import find_photos
 from freegeo.cli.files import FORMAT_NAMES, require_complete
-from freegeo.cli.jobs import FILES, say_finished
+from freegeo.cli.jobs import FILES, say_answer, say_finished
 from freegeo.cli.options import OutputOptions
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.base import DEFAULT_FORMATS
@@ -74,9 +74,10 @@ def refine(
             "command": console.command_line(), "verdict": None, "loss": None, "rejected_adapter": None,
             "warnings": list(dict.fromkeys([*summary.get("warnings", []), *console.warned()])),
         }  # fmt: skip
-        write_json(folder / SUMMARY_NAME, {**summary, **told})
-        write_report(folder.path)
+        summary = {**summary, **told}
+        write_json(folder / SUMMARY_NAME, summary)
+        write_report(folder.path, photos=photos)
         folder.finish()
-    console.say(found.about["reason"])
+    say_answer(summary)
     console.written(output.output, FILES)
     require_complete(output.output, failed)
