@@ -41,7 +41,7 @@ from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import FORMAT, as_json, read_json, remove_written, write_json
 from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
-from freegeo.guarded import Evidence, judge_adapter
+from freegeo.guarded import Evidence, harm, judge_adapter
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import EMBEDDED_MODEL, warn_of_embedded_model
 from freegeo.models.images import read_photos
@@ -275,8 +275,10 @@ def adapt(
         )  # fmt: skip
     if result.trouble:
         logger.warning("%s", _capital(result.trouble))
-    elif guard != "off":
-        judge_by_photos(model, result, [(found, batch)], compute=compute, select=guard == "select")
+        return result
+    judge_by_photos(model, result, [(found, batch)], compute=compute, guard=guard)
+    if result.trouble:
+        logger.warning("%s", _capital(result.trouble))
     return result
 
 
@@ -286,20 +288,21 @@ def judge_by_photos(
     scenes: Sequence[tuple[Sequence[PhotoLike], ImageBatch]],
     *,
     compute: Compute,
-    select: bool,
+    guard: Guard,
     reference: str | None = None,
     frozen: Sequence[Reconstruction] | None = None,
     stores: Sequence[Path | None] | None = None,
 ) -> None:
-    """Let the guard judge a finished adapter by the photos of its scenes, and keep its verdict in the result.
+    """Judge a finished adapter by the photos of its scenes, and keep the verdict in the result.
 
     Args:
         model: with the adapter.
-        result: the finished run; `verdict` is set, and with `select` the adapter is brought into the chosen state. A
-            model without cameras cannot be judged; nothing is changed then.
+        result: the finished run. `verdict` is set unless the guard is off or the model predicts no cameras; with
+            `select` the adapter is brought into the state that it allows. Where the adapter would be used as it was
+            trained, and its predictions are broken, `harm` is set instead.
         scenes: photos, and the same as images for the model.
         compute: where predictions are made.
-        select: see `freegeo.guarded.judge_adapter`.
+        guard: see `freegeo.guarded.judge_adapter`.
         reference: rule of the reference view.
         frozen: predictions without the adapter; None: they are made here.
         stores: files for the matches of the scenes; None: they are not stored.
@@ -310,15 +313,29 @@ def judge_by_photos(
         return found if not_finite(found) is None else None
 
     if frozen is None:
-        with result.adapter.off():
-            frozen = [predict(model, batch, reference=reference, compute=compute) for _, batch in scenes]
-    if not all(one.has_cameras for one in frozen):
+        try:
+            with result.adapter.off():
+                frozen = [predict(model, batch, reference=reference, compute=compute) for _, batch in scenes]
+        except UserError as error:
+            if guard != "off":
+                raise
+            logger.warning("Nobody looked at what the adapter does to predictions: %s", error)
+            return
+    asked = guard != "off" and all(one.has_cameras for one in frozen)
+    if not asked or guard == "report":
+        for (_, batch), before in zip(scenes, frozen, strict=True):
+            found = _predict(model, batch, reference=reference, compute=compute)
+            wrong = not_finite(found) or harm(before, found)
+            if wrong:
+                result.harm = f"{wrong} Lower --lr (now {result.recipe.lr:g}) or take fewer --steps."
+                return
+    if not asked:
         return
     evidence = [
         Evidence(photos=photos, batch=batch, frozen=before, store=store)
         for (photos, batch), before, store in zip(scenes, frozen, stores or [None] * len(scenes), strict=True)
     ]
-    verdict = judge_adapter(result, evidence, predicted, device=str(compute.device), select=select)
+    verdict = judge_adapter(result, evidence, predicted, device=str(compute.device), select=guard == "select")
     logger.info("%s", verdict.reason)
     result.verdict = verdict.as_dict()
 
@@ -490,13 +507,14 @@ class Job:
                 return str(error), None
             self.in_place = result.adapter
             seconds = {"adaptation": round(result.seconds, 2)}
-            if self.guard != "off" and self.photos is not None and result.trouble is None:
-                self.hooks.stage("evidence of the photos")
+            if self.photos is not None and result.trouble is None:
+                self.hooks.stage(
+                    "evidence of the photos" if self.guard != "off" else "comparison with the frozen model"
+                )
                 started = time.monotonic()
                 judge_by_photos(
-                    self.model, result, [(self.photos, self.batch)], compute=self.compute,
-                    select=self.guard == "select", reference=self.reference, frozen=[frozen],
-                    stores=[self.folder / MATCHES_NAME],
+                    self.model, result, [(self.photos, self.batch)], compute=self.compute, guard=self.guard,
+                    reference=self.reference, frozen=[frozen], stores=[self.folder / MATCHES_NAME],
                 )  # fmt: skip
                 seconds["evidence"] = round(time.monotonic() - started, 2)
             result.save(folder)

@@ -8,15 +8,13 @@ from typing import Any, Literal
 
 Outcome = Literal["yes", "no", "unknown"]
 
-HEADER = (
-    "model", "epipolar error, px", "reprojection error, px", "contradicted pixels, %", "matches",
-    "sure it is better, %",
-)  # fmt: skip
+HEADER = ("model", "epipolar error, px", "reprojection error, px", "contradicted pixels, %", "matches", "sure, %")
 NOTE = (
     "Medians over pairs of photos, from matches that no model has a part in: how far matching points lie from their "
     "epipolar lines (cameras), and from where depth and cameras put them, in pixels of the photos as they were "
-    "matched; and the share of pixels whose depth other views contradict. Smaller is better. For refined cameras the "
-    "epipolar error is that of pairs that had no part in the adjustment."
+    "matched; and the share of pixels whose depth other views contradict. Smaller is better. Sure: how certain it is, "
+    "by drawing pairs anew, that the matches fit better than before. For refined cameras the epipolar error is that of "
+    "pairs that had no part in the adjustment."
 )
 OVERLAP = (
     "Take photos that share more: neighbours that overlap by two thirds, from different places instead of turns on the "
