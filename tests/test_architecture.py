@@ -11,15 +11,16 @@ ANYWHERE = {"types", "errors", "files", "run_folder", "__init__"}
 ALLOWED = {
     "pipeline": {
         *("models", "data", "adaptation", "evidence", "fusion", "export", "report", "metrics", "geometry", "progress"),
-        "guarded",
+        *("guarded", "refined"),
     },
     "guarded": {"adaptation", "evidence", "export"},
+    "refined": {"evidence", "export", "fusion", "guarded"},
     "progress": {"adaptation"},
     "benchmark": {"adaptation", "models", "data", "fusion", "metrics", "geometry"},
     "training": {"models", "data", "metrics", "geometry"},
     "adaptation": {"models", "data.scene", "geometry"},
     "evidence": {"export", "fusion", "metrics", "geometry"},
-    "report": {"export", "metrics", "geometry"},
+    "report": {"evidence", "export", "metrics", "geometry"},
     "export": {"fusion", "geometry"},
     "fusion": {"geometry"},
     "metrics": {"data.scene", "geometry"},

@@ -18,6 +18,8 @@ from freegeo.adaptation.state import UNFINISHED_FILE
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.evidence.guard import State, states
 from freegeo.export.reconstruction import Reconstruction
+from freegeo.files import read_json
+from freegeo.guarded import harm
 from freegeo.models import api
 from tiny_models import noise, quick, same, tensors, tiny_da3, trained
 
@@ -406,3 +408,74 @@ def test_states_on_the_way_outlive_a_stop(model, tmp_path, judged):
     for (state, one), (other, two) in zip(continued, judged["tried"], strict=True):
         assert state == other
         assert torch.equal(one, two)
+
+
+# -- what is used in no mode
+
+
+def walked(found: Reconstruction) -> Reconstruction:
+    """The prediction with cameras that are apart; those of random weights are in one place."""
+    T = found.T_cam_world.copy()
+    T[:, 0, 3] += np.linspace(0, 3, VIEWS, dtype=np.float32)
+    return replace(found, T_cam_world=T)
+
+
+def in_one_place(found: Reconstruction) -> Reconstruction:
+    return replace(found, T_cam_world=np.tile(found.T_cam_world[:1], (VIEWS, 1, 1)))
+
+
+def with_little_depth(found: Reconstruction) -> Reconstruction:
+    return replace(found, depth_z=np.where(np.arange(SIDE) < 0.6 * SIDE, np.nan, found.depth_z).astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("guard", "broken", "words"),
+    [
+        ("off", in_one_place, "the cameras collapse"),
+        ("report", in_one_place, "the cameras collapse"),
+        ("off", lambda found: replace(found, depth_z=found.depth_z / 9), "drift apart in scale"),
+        ("off", with_little_depth, "of the pixels with usable depth are left"),
+        ("off", lambda found: replace(found, K=np.full_like(found.K, np.nan)), "not a finite number"),
+    ],
+)
+def test_broken_predictions_are_trouble_in_any_mode(model, tmp_path, monkeypatch, caplog, guard, broken, words):
+    plain = pipeline._predict
+
+    def predicted(model, batch, **options):
+        found = walked(plain(model, batch, **options))
+        return broken(found) if is_adapted(model) else found
+
+    monkeypatch.setattr(pipeline, "_predict", predicted)
+    result = freegeo.adapt(model, pictures(), steps=3, sets=2, lr=1e-3, guard=guard)
+    assert result.trouble is not None and words in result.trouble and "Lower --lr (now 0.001)" in result.trouble
+    assert result.verdict is None
+    assert words in caplog.text
+    result.save(tmp_path)
+    assert words in read_json(tmp_path / "freegeo.json")["trouble"]
+
+
+def test_photos_that_cannot_be_predicted_together_cost_no_adapter(model, monkeypatch, caplog):
+    def too_large(*arguments, **options):
+        raise UserError("too large")
+
+    monkeypatch.setattr(pipeline, "plan_reconstruction", too_large)
+    assert freegeo.adapt(model, pictures(), steps=3, sets=2, lr=1e-3, guard="off").trouble is None
+    assert "Nobody looked at what the adapter does to predictions: too large" in caplog.text
+
+
+def test_predictions_that_differ_by_frame_scale_and_little_else_are_no_harm(model):
+    found = walked(freegeo.reconstruct(model, pictures()))
+    T = found.T_cam_world
+    larger = T.copy()
+    larger[:, :3, 3] *= 5
+    assert harm(found, replace(found, T_cam_world=larger, depth_z=5 * found.depth_z)) is None
+    nearer = T.copy()
+    nearer[:, :3, 3] *= 0.6
+    assert harm(found, replace(found, T_cam_world=nearer)) is None
+    # Photos from one place stay photos from one place, whatever noise their positions have.
+    still = np.tile(np.eye(4, dtype=np.float32), (VIEWS, 1, 1))
+    noisy = still.copy()
+    noisy[:, 0, 3] = 0.02 * found.depth_z.mean() * np.arange(VIEWS) / VIEWS
+    assert harm(replace(found, T_cam_world=still), replace(found, T_cam_world=noisy)) is None
+    blind = replace(found, T_cam_world=None, K=None)
+    assert harm(blind, blind) is None

@@ -65,9 +65,9 @@ def noise_scene(views: int, seed: int = 0) -> SceneImages:
 
 
 def quick(model: ReconstructionModel, **changes) -> Recipe:
-    """Return the recipe `scene`, small enough for a test."""
+    """Return the recipe `scene`, small enough for a test, and without `hold`."""
     length = {} if "epochs" in changes else {"steps": 4}
-    return scene(model.spec).changed(**{**length, "sets_per_scene": 3, "distinct_seeds": 3, **changes})
+    return scene(model.spec).changed(**{**length, "sets_per_scene": 3, "distinct_seeds": 3, "hold": 0.0, **changes})
 
 
 def outputs(model: ReconstructionModel, images: Tensor) -> list[Tensor]:

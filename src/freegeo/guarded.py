@@ -1,10 +1,15 @@
-"""An adapter under guard: matches between the photos decide whether it is used, in which state (docs/guard.md)."""
+"""An adapter under guard: matches between the photos decide whether it is used, in which state (docs/guard.md).
+
+`harm` needs no matches: it sees what no adaptation that is of use does to a prediction.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from freegeo.adaptation.adapt import Adapted
 from freegeo.evidence.candidate import Candidate
@@ -13,6 +18,44 @@ from freegeo.evidence.guard import Reference, State, Verdict, try_states
 from freegeo.evidence.matches import ALL_PAIRS_UP_TO, Matches, choose_pairs, find_matches, stored_matches
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.types import ImageBatch, PhotoLike
+
+HARM = 3.0
+"""Factor, up or down, between distances of cameras and depth. Useful runs were seen to change it by up to 1.15, runs
+that were lost by 12 and more."""
+_SPREAD_FLOOR = 0.02
+"""Distance of cameras as a share of depth, added before comparing: photos from one place have none."""
+
+
+def harm(before: Reconstruction, after: Reconstruction) -> str | None:
+    """Return what is so wrong with an adapted prediction that it is used in no mode, in one sentence; None: nothing.
+
+    Args:
+        before: by the frozen model.
+        after: of the same photos, with the adapter.
+    """
+    usable = [int(one.valid_pixels().sum()) for one in (before, after)]
+    if 2 * usable[1] < usable[0]:
+        share = usable[1] / usable[0]
+        return f"with the adapter only {share:.0%} of the pixels with usable depth are left."
+    if not before.has_cameras or len(before) < 2:
+        return None
+    was, now = (_spread(one) + _SPREAD_FLOOR for one in (before, after))
+    if now * HARM < was:
+        return f"with the adapter the cameras collapse: {was / now:.0f} times closer together, compared with depth."
+    if now > was * HARM:
+        return (
+            "with the adapter depth and camera positions drift apart in scale: the cameras are "
+            f"{now / was:.0f} times farther from each other, compared with depth."
+        )
+    return None
+
+
+def _spread(prediction: Reconstruction) -> float:
+    """Median distance between two cameras over the median depth."""
+    T = prediction.cameras()[0].astype(np.float64)
+    centres = -np.einsum("sji,sj->si", T[:, :3, :3], T[:, :3, 3])
+    apart = np.linalg.norm(centres[:, None] - centres, axis=-1)[np.triu_indices(len(T), 1)]
+    return float(np.median(apart) / np.median(prediction.depth_z[prediction.valid_pixels()]))
 
 
 def scene_matches(

@@ -29,24 +29,26 @@ from freegeo.adaptation.state import remove_state
 from freegeo.data.photos import MAX_VIEWS, load_photos
 from freegeo.errors import DivergedError, FreeGeoError, UserError
 from freegeo.evidence.guard import SHARES
-from freegeo.export.base import DEFAULT_FORMATS
+from freegeo.export.base import DEFAULT_FORMATS, TRACKS_NAME
 from freegeo.export.formats import export, filter_reconstruction
-from freegeo.export.kept import Filtered, save_kept
+from freegeo.export.kept import save_kept
+from freegeo.export.measured import load_tracks, save_tracks
 from freegeo.export.photos import FOLDER as COPIES_FOLDER
 from freegeo.export.photos import photo_records
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import FILE_NAME as PREDICTION_NAME
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.files import FORMAT, as_json, read_json, write_json
+from freegeo.files import FORMAT, as_json, read_json, remove_written, write_json
 from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
-from freegeo.guarded import Evidence, judge_adapter
+from freegeo.guarded import Evidence, harm, judge_adapter
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import EMBEDDED_MODEL, warn_of_embedded_model
 from freegeo.models.images import read_photos
 from freegeo.models.precision import Compute
 from freegeo.models.spec import MIXED, Mixed, ModelSpec
 from freegeo.progress import step_bar
+from freegeo.refined import refine_by_photos
 from freegeo.report.page import write_report
 from freegeo.run_folder import Part, RunFolder
 from freegeo.types import ImageBatch, PhotoLike
@@ -60,12 +62,22 @@ SUMMARY_NAME = "reconstruction.json"
 FROZEN_FOLDER = "frozen"
 FILES_STAGE = "points and files"
 MATCHES_NAME = "matches.npz"
+UNREFINED_FOLDER = "unrefined"
+"""Holds the model's prediction where the result is a refined one, unless that is the frozen one of `FROZEN_FOLDER`."""
 ADAPTATION = Part("adaptation", (f"{ADAPTER_FOLDER}/", MATCHES_NAME))
-PREDICTION = Part("prediction", (f"{FROZEN_FOLDER}/{PREDICTION_NAME}", PREDICTION_NAME, f"{COPIES_FOLDER}/"))
+PREDICTION = Part(
+    "prediction",
+    (
+        f"{FROZEN_FOLDER}/{PREDICTION_NAME}", PREDICTION_NAME, f"{UNREFINED_FOLDER}/{PREDICTION_NAME}",
+        f"{COPIES_FOLDER}/",
+    ),
+)  # fmt: skip
+REFINEMENT = Part("refinement", (TRACKS_NAME,), free=True)
 FILTERS = Part("filters", ("",), free=True)
 FORMATS = Part("formats", (), free=True)
-PARTS = (ADAPTATION, PREDICTION, FILTERS, FORMATS)
-"""Parts of a job's settings: photos, model and adapter; how they are used; which pixels become points; which files."""
+PARTS = (ADAPTATION, PREDICTION, REFINEMENT, FILTERS, FORMATS)
+"""Parts of a job's settings: photos, model and adapter; how they are used; whether bundle adjustment follows; which
+pixels become points; which files."""
 CPU = Compute()
 _warned_of: list[str] = []
 
@@ -263,8 +275,10 @@ def adapt(
         )  # fmt: skip
     if result.trouble:
         logger.warning("%s", _capital(result.trouble))
-    elif guard != "off":
-        judge_by_photos(model, result, [(found, batch)], compute=compute, select=guard == "select")
+        return result
+    judge_by_photos(model, result, [(found, batch)], compute=compute, guard=guard)
+    if result.trouble:
+        logger.warning("%s", _capital(result.trouble))
     return result
 
 
@@ -274,20 +288,21 @@ def judge_by_photos(
     scenes: Sequence[tuple[Sequence[PhotoLike], ImageBatch]],
     *,
     compute: Compute,
-    select: bool,
+    guard: Guard,
     reference: str | None = None,
     frozen: Sequence[Reconstruction] | None = None,
     stores: Sequence[Path | None] | None = None,
 ) -> None:
-    """Let the guard judge a finished adapter by the photos of its scenes, and keep its verdict in the result.
+    """Judge a finished adapter by the photos of its scenes, and keep the verdict in the result.
 
     Args:
         model: with the adapter.
-        result: the finished run; `verdict` is set, and with `select` the adapter is brought into the chosen state. A
-            model without cameras cannot be judged; nothing is changed then.
+        result: the finished run. `verdict` is set unless the guard is off or the model predicts no cameras; with
+            `select` the adapter is brought into the state that it allows. Where the adapter would be used as it was
+            trained, and its predictions are broken, `harm` is set instead.
         scenes: photos, and the same as images for the model.
         compute: where predictions are made.
-        select: see `freegeo.guarded.judge_adapter`.
+        guard: see `freegeo.guarded.judge_adapter`.
         reference: rule of the reference view.
         frozen: predictions without the adapter; None: they are made here.
         stores: files for the matches of the scenes; None: they are not stored.
@@ -298,15 +313,29 @@ def judge_by_photos(
         return found if not_finite(found) is None else None
 
     if frozen is None:
-        with result.adapter.off():
-            frozen = [predict(model, batch, reference=reference, compute=compute) for _, batch in scenes]
-    if not all(one.has_cameras for one in frozen):
+        try:
+            with result.adapter.off():
+                frozen = [predict(model, batch, reference=reference, compute=compute) for _, batch in scenes]
+        except UserError as error:
+            if guard != "off":
+                raise
+            logger.warning("Nobody looked at what the adapter does to predictions: %s", error)
+            return
+    asked = guard != "off" and all(one.has_cameras for one in frozen)
+    if not asked or guard == "report":
+        for (_, batch), before in zip(scenes, frozen, strict=True):
+            found = _predict(model, batch, reference=reference, compute=compute)
+            wrong = not_finite(found) or harm(before, found)
+            if wrong:
+                result.harm = f"{wrong} Lower --lr (now {result.recipe.lr:g}) or take fewer --steps."
+                return
+    if not asked:
         return
     evidence = [
         Evidence(photos=photos, batch=batch, frozen=before, store=store)
         for (photos, batch), before, store in zip(scenes, frozen, stores or [None] * len(scenes), strict=True)
     ]
-    verdict = judge_adapter(result, evidence, predicted, device=str(compute.device), select=select)
+    verdict = judge_adapter(result, evidence, predicted, device=str(compute.device), select=guard == "select")
     logger.info("%s", verdict.reason)
     result.verdict = verdict.as_dict()
 
@@ -378,6 +407,8 @@ class Job:
     """A saved adapter to reconstruct with, instead of training one."""
     guard: Guard = "select"
     """Whether the photos' matches judge the adapter, and whether their verdict decides what is used."""
+    refine: bool = False
+    """Whether the cameras are brought to the matches between the photos by bundle adjustment."""
     seed: int = SEED
     compute: Compute = CPU
     reference: str | None = None
@@ -431,21 +462,21 @@ class Job:
                 final, rejected = self._adapted_prediction(frozen)
         if rejected is not None:
             self._warn(f"{_capital(rejected)} The result is that of the frozen model.")
-        if final is frozen:
-            final.save(self.folder.path)
-        report, failed = self._export(final, frozen)
-        summary = self._summary(final, frozen, report, rejected, verdict, failed)
+        trained = self.recipe is not None and final is not frozen
+        final = self._refined(final, frozen)
+        report, failed = self._export(final)
+        summary = self._summary(final, report, rejected, verdict, failed, trained=trained)
         write_json(self.folder / SUMMARY_NAME, summary)
         self.after(self)
         self.hooks.stage("report")
-        write_report(self.folder.path)
+        write_report(self.folder.path, photos=self.photos)
         self.folder.finish()
         return summary
 
     def _predicted(self, folder: Path, stage: str) -> Reconstruction:
         """Predict with the frozen model, or with `adapter`, or read what is there already."""
         if (folder / PREDICTION_NAME).is_file():
-            return Reconstruction.load(folder)
+            return Reconstruction.load(self._unrefined if folder == self.folder.path else folder)
         if self.adapter is not None:
             assert self.in_place is not None
         with self._timed(stage):
@@ -476,13 +507,14 @@ class Job:
                 return str(error), None
             self.in_place = result.adapter
             seconds = {"adaptation": round(result.seconds, 2)}
-            if self.guard != "off" and self.photos is not None and result.trouble is None:
-                self.hooks.stage("evidence of the photos")
+            if self.photos is not None and result.trouble is None:
+                self.hooks.stage(
+                    "evidence of the photos" if self.guard != "off" else "comparison with the frozen model"
+                )
                 started = time.monotonic()
                 judge_by_photos(
-                    self.model, result, [(self.photos, self.batch)], compute=self.compute,
-                    select=self.guard == "select", reference=self.reference, frozen=[frozen],
-                    stores=[self.folder / MATCHES_NAME],
+                    self.model, result, [(self.photos, self.batch)], compute=self.compute, guard=self.guard,
+                    reference=self.reference, frozen=[frozen], stores=[self.folder / MATCHES_NAME],
                 )  # fmt: skip
                 seconds["evidence"] = round(time.monotonic() - started, 2)
             result.save(folder)
@@ -495,7 +527,7 @@ class Job:
         path = self.folder.path
         if (path / PREDICTION_NAME).is_file():
             rejected = self._noted("prediction").get("rejected")
-            return (Reconstruction.load(path), None) if rejected is None else (frozen, rejected)
+            return (Reconstruction.load(self._unrefined), None) if rejected is None else (frozen, rejected)
         assert self.in_place is not None
         with self._timed("adapted prediction"):
             result = _predict(self.model, self.batch, reference=self.reference, compute=self.compute)
@@ -508,46 +540,61 @@ class Job:
         self.folder.note("prediction", {**self._noted("prediction"), "rejected": rejected})
         return frozen, rejected
 
+    @property
+    def _unrefined(self) -> Path:
+        """Folder of the model's prediction, whether the result is refined or not."""
+        before = self.folder / UNREFINED_FOLDER
+        return before if (before / PREDICTION_NAME).is_file() else self.folder.path
+
+    def _refined(self, chosen: Reconstruction, frozen: Reconstruction | None) -> Reconstruction:
+        """Make the result of the chosen prediction, and see that it is in the folder: refined if that is asked for."""
+        path, before = self.folder.path, self.folder / UNREFINED_FOLDER
+        if self.refine and "accepted" not in self._noted("refinement"):
+            assert self.photos is not None
+            with self._timed("refinement", REFINEMENT):
+                found = refine_by_photos(
+                    chosen, self.photos, frozen=None if chosen is frozen else frozen,
+                    store=self.folder / MATCHES_NAME, device=str(self.compute.device),
+                )  # fmt: skip
+                if found.tracks is not None:
+                    if chosen is not frozen:
+                        chosen.save(before)
+                    save_tracks(path, found.tracks)
+                    found.result.save(path)
+                self.folder.note("refinement", {**self._noted("refinement"), **found.about})
+            logger.info("%s: %s", "refined" if found.tracks is not None else "not refined", found.about["reason"])
+        if self.refine and self._noted("refinement")["accepted"]:
+            return Reconstruction.load(path)
+        if chosen is frozen or self._unrefined == before:
+            chosen.save(path)
+            remove_written(before)
+        return chosen
+
     def _warn(self, sentence: str) -> None:
         """Log a warning that reconstruction.json must hold, whoever listens to the log."""
         logger.warning("%s", sentence)
         if sentence not in self.warnings:
             self.warnings.append(sentence)
 
-    def _export(
-        self, final: Reconstruction, frozen: Reconstruction | None
-    ) -> tuple[FilterReport | None, Mapping[str, str]]:
-        """Filter each reconstruction once and write all formats.
-
-        Returns what the filters removed (None without cameras, which have no points), and why formats were not written.
-        """
-        with self._timed(FILES_STAGE):
+    def _export(self, final: Reconstruction) -> tuple[FilterReport | None, Mapping[str, str]]:
+        """Filter each reconstruction once and write all formats; returns as `write_files`."""
+        with self._timed(FILES_STAGE, FILTERS):
             masks = None if self.masks is None else masks_for_model(final, self.masks)
-            filtered = None
-            if final.has_cameras:
-                if frozen is not None:
-                    save_kept(self.folder / FROZEN_FOLDER, self._filtered(frozen, masks), masks)
-                filtered = self._filtered(final, masks)
-                save_kept(self.folder.path, filtered, masks)
-            exported = export(
-                final, self.folder.path, self.formats, filtered=filtered, masks=masks, photos=self.photos,
+            return write_files(
+                self.folder.path, final, self.formats, filters=self.filters, masks=masks, photos=self.photos,
                 seed=self.seed,
             )  # fmt: skip
-        return None if filtered is None else filtered[1], exported.failed
-
-    def _filtered(self, reconstruction: Reconstruction, masks: np.ndarray | None) -> Filtered:
-        return filter_reconstruction(reconstruction, masks=masks, settings=self.filters)
 
     def _summary(
         self,
         final: Reconstruction,
-        frozen: Reconstruction | None,
         report: FilterReport | None,
         rejected: str | None,
         verdict: Mapping[str, Any] | None,
         failed: Mapping[str, str],
+        *,
+        trained: bool,
     ) -> dict[str, Any]:
-        trained = self.recipe is not None and final is not frozen
         settings = dict(self.folder.settings)
         seconds = {name: value for part in self.folder.notes.values() for name, value in part["seconds"].items()}
         return {
@@ -561,7 +608,8 @@ class Job:
             "adapter": ADAPTER_FOLDER if trained else (str(self.adapter) if self.adapter else None),
             "rejected_adapter": None if trained or self.recipe is None else rejected or (verdict or {}).get("reason"),
             "verdict": verdict,
-            "frozen_prediction": f"{FROZEN_FOLDER}/{PREDICTION_NAME}" if frozen is not None else None,
+            "refinement": {k: v for k, v in self._noted("refinement").items() if k != "seconds"} or None,
+            "frozen_prediction": None if self.recipe is None else f"{FROZEN_FOLDER}/{PREDICTION_NAME}",
             "reference_view": self.reference or self.spec.reference,
             "not_written": dict(failed),
             "warnings": list(self.warnings),
@@ -585,15 +633,52 @@ class Job:
         return loss_change(read_json(metadata)["loss_curve"])
 
     @contextmanager
-    def _timed(self, stage: str) -> Generator[None]:
+    def _timed(self, stage: str, part: Part = PREDICTION) -> Generator[None]:
         """Announce a stage and note how long it took, also for processes that continue this run."""
         self.hooks.stage(stage)
         started = time.monotonic()
         yield
-        part = FILTERS if stage == FILES_STAGE else PREDICTION
         noted = self._noted(part.name)
         seconds = {**noted["seconds"], stage: round(time.monotonic() - started, 2)}
         self.folder.note(part.name, {**noted, "seconds": seconds})
+
+
+def write_files(
+    folder: Path,
+    result: Reconstruction,
+    formats: Sequence[str],
+    *,
+    filters: FilterSettings | None = None,
+    masks: np.ndarray | None = None,
+    photos: Sequence[PhotoLike] | None = None,
+    seed: int = SEED,
+) -> tuple[FilterReport | None, Mapping[str, str]]:
+    """Choose the points of a result and of the predictions before it, and write the result's files.
+
+    Args:
+        folder: holds the result, and in subfolders the predictions before adaptation and before refinement, if any.
+        result: what is in the folder.
+        formats: names of `freegeo.export.formats.FORMATS`.
+        filters: which points are kept; None: the defaults.
+        masks: (S, H, W) bool, pixels that the user wants; None: all.
+        photos: the photos, of which some formats write copies.
+        seed: of the random choice of points.
+
+    Returns:
+        What the filters removed (None without cameras, which have no points), and why formats were not written.
+    """
+    filtered = None
+    if result.has_cameras:
+        for name in (FROZEN_FOLDER, UNREFINED_FOLDER):
+            if (folder / name / PREDICTION_NAME).is_file():
+                before = Reconstruction.load(folder / name)
+                save_kept(folder / name, filter_reconstruction(before, masks=masks, settings=filters), masks)
+        filtered = filter_reconstruction(result, masks=masks, settings=filters)
+        save_kept(folder, filtered, masks)
+    exported = export(
+        result, folder, formats, filtered=filtered, masks=masks, photos=photos, tracks=load_tracks(folder), seed=seed
+    )
+    return None if filtered is None else filtered[1], exported.failed
 
 
 def versions() -> dict[str, str]:

@@ -69,6 +69,11 @@ def test_the_papers_settings_are_those_of_a_published_model():
     assert (recipes.PAPER.views, recipes.PAPER.rank, recipes.PAPER.alpha) == (8, 32, 32)
 
 
+def test_only_our_own_recipe_holds_the_answer_from_all_photos():
+    assert recipes.scene(SPEC).hold == 1
+    assert {recipes.named(name, GIANT, dataset).hold for name, dataset in PUBLISHED} == {0}
+
+
 @pytest.mark.parametrize("views", range(3, 11))
 def test_every_recipe_keeps_every_second_view(views):
     """Eight views keep (0, 2, 4, 6), as in the paper; scenes of fewer views and `--views` keep to the same rule."""

@@ -8,6 +8,7 @@ from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
 from conftest import ARGUMENTS, CHROMIUM
+from freegeo.data.photos import load_photos
 from freegeo.report.page import write_report
 from freegeo.report.viewer import open_viewer
 
@@ -24,7 +25,7 @@ def save(page: Page, name: str) -> None:
 
 
 def main(folder: Path) -> None:
-    address = write_report(folder).resolve().as_uri()
+    address = write_report(folder, photos=load_photos(folder / "photos")).resolve().as_uri()
     viewer = open_viewer([folder], port=PORT)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)

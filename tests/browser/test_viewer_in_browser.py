@@ -69,7 +69,7 @@ def test_the_viewer_follows_its_controls(open_page, viewer):
     assert drawn(settled(page)) > 1.05 * drawn(start)
     shown.size.value = 1.5
 
-    page.get_by_role("button", name="Swap frozen / adapted").click()
+    page.get_by_role("button", name="Swap before / after").click()
     page.wait_for_timeout(500)
     assert shown.shown.value == "frozen"
     assert (settled(page) != start).any(axis=-1).sum() > 1000

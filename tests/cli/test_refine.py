@@ -1,6 +1,7 @@
 """`refine`: a result whose cameras fit the photos better, or a sentence and nothing."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -85,3 +86,65 @@ def test_photos_that_are_gone_are_missed(freegeo, result, tmp_path):
     assert outcome.code == 2
     assert "its photos are not where they were" in outcome.sentence()
     assert not (tmp_path / "refined").exists()
+
+
+# -- as a part of `run` and `reconstruct`
+
+
+def cameras(folder):
+    return Reconstruction.load(folder).cameras()[0]
+
+
+def test_a_refined_reconstruction_is_the_result_and_can_be_taken_back(freegeo, result, tiny, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    command = ("reconstruct", result / "photos", "-o", out, *tiny, "--formats", "ply", "colmap", "--refine")
+    outcome = freegeo(*command, "ba")
+    assert outcome.code == 0, outcome.err
+    summary = json.loads((out / "reconstruction.json").read_text())
+    told = summary["refinement"]
+    assert told["accepted"] and told["probability"] >= 0.9 and told["after"]["matches"] > 100
+    assert told["after"]["epipolar_px"] < 0.2 * told["before"]["epipolar_px"]
+    assert told["reason"] in outcome.out
+    assert "refinement" in summary["seconds"]
+    refined, before = cameras(out), cameras(out / "unrefined")
+    assert not np.allclose(refined, before, atol=1e-3)
+    assert "Observations are measured matches" in (out / "colmap/README.txt").read_text()
+    assert {"tracks.npz", "matches.npz", "kept.npz"} <= {path.name for path in out.iterdir()}
+    assert "already finished" in freegeo(*command, "ba").out
+    assert freegeo("export", out, "-f", "colmap", "-o", tmp_path / "copy").code == 0
+    assert "Observations are measured matches" in (tmp_path / "copy/colmap/README.txt").read_text()
+    assert "refined already" in freegeo("refine", out, "-o", tmp_path / "twice").sentence()
+
+    # Neither the network nor the matcher is asked again.
+    monkeypatch.setattr("freegeo.models.catalog.load_model", None)
+    monkeypatch.setattr("freegeo.evidence.matches._matched", None)
+    assert freegeo(*command, "off").code == 0
+    assert np.array_equal(cameras(out), before)
+    assert "Observations are re-projections" in (out / "colmap/README.txt").read_text()
+    assert not (out / "tracks.npz").exists() and not (out / "unrefined").exists()
+    assert json.loads((out / "reconstruction.json").read_text())["refinement"] is None
+    assert freegeo(*command, "ba").code == 0
+    assert np.array_equal(cameras(out), refined)
+
+
+def test_a_refused_refinement_leaves_the_result_and_says_why(freegeo, photo_folder, tiny, tmp_path):
+    pytest.importorskip("pycolmap", reason="needs the extra colmap")
+    command = ("reconstruct", photo_folder, "-o", tmp_path / "out", *tiny, "--formats", "npz")
+    assert freegeo(*command).code == 0
+    before = cameras(tmp_path / "out")
+    outcome = freegeo(*command, "--refine", "ba")
+    assert outcome.code == 0, outcome.err
+    assert np.array_equal(cameras(tmp_path / "out"), before)
+    told = json.loads((tmp_path / "out/reconstruction.json").read_text())["refinement"]
+    assert not told["accepted"]
+    for text in (outcome.out, outcome.err):
+        assert told["reason"] in text
+    assert not (tmp_path / "out/unrefined").exists() and not (tmp_path / "out/tracks.npz").exists()
+
+
+@pytest.mark.parametrize("command", ["run", "reconstruct"])
+def test_a_missing_extra_is_said_before_the_photos_are_read(freegeo, tmp_path, monkeypatch, command):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    outcome = freegeo(command, tmp_path / "no photos", "-o", tmp_path / "out", "--refine", "ba")
+    assert outcome.code == 2
+    assert "pip install 'freegeo[colmap]'" in outcome.sentence()

@@ -7,7 +7,7 @@ from exact_rooms import PHOTO_SCALE, room
 from freegeo.data.procedural import render, sample_rooms
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.colmap import FOLDER, write_colmap
-from freegeo.export.formats import FORMATS, check_formats, export
+from freegeo.export.formats import check_formats, export
 from freegeo.export.pixels import corner_K, corner_pixels
 from freegeo.files import LEDGER_FILE, atomic_folder, keep_ledger
 from freegeo.fusion.tracks import build_tracks
@@ -162,12 +162,29 @@ def test_files_that_an_older_pycolmap_wrote_do_not_mix_with_new_ones(tmp_path):
     assert set((tmp_path / "0").iterdir()) == set(new)
 
 
-def test_the_export_says_what_bundle_adjustment_cannot_do(tmp_path, caplog):
+@pytest.mark.parametrize("measured", [False, True])
+def test_the_export_says_what_its_observations_are(tmp_path, caplog, measured):
     caplog.set_level("INFO")
-    export(room(VIEWS, HW, SEED, CROP), tmp_path, ["colmap"], max_tracks=20)
+    scene = room(VIEWS, HW, SEED, CROP)
+    export(scene, tmp_path, ["colmap"], max_tracks=20, tracks=tracks_of(scene, max_points=30) if measured else None)
     for text in (caplog.text, (tmp_path / "colmap" / "README.txt").read_text()):
-        assert "bundle adjustment" in text.lower() and "cannot improve" in text
-    assert "not measured" in FORMATS["colmap"].about
+        assert ("observations are measured matches" in text.lower()) == measured
+        assert ("observations are re-projections of the prediction" in text.lower()) != measured
+        assert ("bundle adjustment" in text.lower() and "cannot improve" in text) != measured
+    assert len(pycolmap.Reconstruction(tmp_path / "colmap/sparse/0").points3D) == 20
+
+
+def test_measured_points_keep_to_the_masks(tmp_path):
+    scene = room(VIEWS, HW, SEED, CROP)
+    masks = np.ones(scene.depth_z.shape, bool)
+    masks[0, :, : masks.shape[2] // 2] = False
+    tracks = tracks_of(scene, max_points=200)
+    export(scene, tmp_path, ["colmap"], tracks=tracks, masks=masks)
+    model = pycolmap.Reconstruction(tmp_path / "colmap/sparse/0")
+    left = corner_pixels(scene, np.zeros(1, np.int64), np.array([[masks.shape[2] / 2 - 0.5, 0.0]]))[0, 0]
+    seen = [p.xy[0] for p in model.images[1].points2D if p.has_point3D()]
+    assert 0 < len(model.points3D) < len(tracks)
+    assert min(seen) >= left
 
 
 def test_failures_are_one_sentence_and_leave_nothing(tmp_path, monkeypatch):

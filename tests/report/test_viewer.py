@@ -117,6 +117,16 @@ def test_the_mesh_follows_its_points(tmp_path):
         shown.close()
 
 
+def test_the_panel_says_whether_it_helped(example):
+    result = viewer.load_result(example)
+    assert viewer.answer_text(result) is None
+    scores = {"epipolar_px": 2.0, "reprojection_px": 3.0, "depth_agreement": 0.9, "matches": 1200}
+    told = {"accepted": True, "reason": "So.", "probability": 1.0, "before": scores, "after": scores}
+    text = viewer.answer_text(dataclasses.replace(result, summary={**result.summary, "refinement": told}))
+    assert text is not None and text.startswith("**Refinement: yes.** So.")
+    assert "**refined (used)**: epipolar error 2.00 px, contradicted pixels 10.0 %, 1,200 matches" in text
+
+
 def test_a_port_in_use_is_one_sentence(example):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

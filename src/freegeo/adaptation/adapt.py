@@ -73,6 +73,8 @@ class Adapted:
     """The adapter after the shares of the steps that `adapt` was told to keep, as `Adapter.load` takes it."""
     verdict: Mapping[str, Any] | None = None
     """What the matches between the photos say (`freegeo.evidence.guard.Verdict.as_dict`); None: nobody asked."""
+    harm: str | None = None
+    """What is so wrong with the predictions that the adapter is not to be used, in one sentence; see `trouble`."""
     seconds: float = 0.0
     """Duration, with that of the earlier parts of a run that was continued."""
     precision: str = "fp32"
@@ -89,7 +91,7 @@ class Adapted:
     def trouble(self) -> str | None:
         """Why the adapter should not be used, in one sentence, and what to do; None where it may be (see `trouble`)."""
         broken = [name for name, value in self.adapter.named_parameters().items() if not bool(value.isfinite().all())]
-        return trouble(self.gain, broken, self.recipe)
+        return trouble(self.gain, broken, self.recipe) or self.harm
 
     def metadata(self) -> dict[str, Any]:
         """Return the entries of freegeo.json that describe the run."""

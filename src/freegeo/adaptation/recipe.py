@@ -160,7 +160,7 @@ class Recipe:
     neighbours: bool
     """Whether the views of a set are consecutive frames, for models trained on such views only; else random ones."""
     hold: float
-    """Weight of the distance between adapted and frozen features of all N views; 0, as in the paper: no such term."""
+    """Weight of the distance between adapted and frozen features of all N views; 0: no such term, as in the paper."""
     augmentation: Literal["none", "released"]
     """`released`: mirror the set with p = .5, brighten each view with p = .5 by U(.8, 1.2), fixed by the set's seed."""
     squash: int | None
@@ -382,11 +382,11 @@ def named(name: str, spec: ModelSpec, dataset: str | None = None) -> Recipe:
 
 
 def scene(spec: ModelSpec) -> Recipe:
-    """Return the recipe for one source: the paper's losses, the model's rate, 100 steps of batch 1, 10 view sets."""
+    """Return the recipe for one source: the paper's losses and `hold`, the model's rate, 100 steps of batch 1."""
     own = spec.adaptation
     found = PAPER.changed(
         name="scene", steps=100, batch=1, sets_per_scene=10, distinct_seeds=10, lr=own.scene_lr,
-        final_lr=own.scene_lr / 1000, rank=own.rank, neighbours=own.neighbours,
+        final_lr=own.scene_lr / 1000, rank=own.rank, neighbours=own.neighbours, hold=1.0,
         loss={"temperature": own.temperature},
     )  # fmt: skip
     return replace(found, precision=None)

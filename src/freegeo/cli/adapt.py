@@ -108,8 +108,8 @@ def _train(
             loaded, images, plan, seed=model.seed, compute=model.compute(), resume_in=folder, on_step=on_step,
             on_epoch=keep_epoch, keep_after=() if guard == "off" else SHARES,
         )  # fmt: skip
-    if guard != "off" and result.trouble is None:
-        judge_by_photos(loaded, result, scenes, compute=model.compute(), select=guard == "select")
+    if result.trouble is None:
+        judge_by_photos(loaded, result, scenes, compute=model.compute(), guard=guard)
     result.save(folder)
     if result.trouble:
         raise FreeGeoError(f"{folder}: {result.trouble} The adapter is there to be looked at; do not use it.")

@@ -51,6 +51,7 @@ def export(
     """
     from freegeo.export import formats
     from freegeo.export.kept import load_kept, load_masks
+    from freegeo.export.measured import load_tracks
     from freegeo.export.pixels import masks_for_model
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.pipeline import FROZEN_FOLDER
@@ -81,6 +82,7 @@ def export(
         result = formats.export(
             reconstruction, target, names, filtered=filtered, masks=masks,
             photos=find_photos(reconstruction, run or home), max_points=max_points, max_tracks=max_tracks, voxel=voxel,
+            tracks=load_tracks(home),
         ).require_any()  # fmt: skip
     for file in result.files:
         console.say(f"  {file}  {console.size(file)}")

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
 from freegeo.cli.files import FileOptions, require_complete
-from freegeo.cli.options import ModelOptions, OutputOptions, RecipeOptions
+from freegeo.cli.options import ModelOptions, OutputOptions, RecipeOptions, Refine
 from freegeo.export import reconstruction as npz
-from freegeo.export.base import KEPT_NAME
+from freegeo.export.base import KEPT_NAME, TRACKS_NAME
 from freegeo.export.formats import FORMATS
 from freegeo.export.photos import FOLDER as COPIES_FOLDER
 from freegeo.export.photos import write_copies
@@ -32,7 +32,7 @@ LABELS = {
     "photos": "other photos", "photo_contents": _OTHER_CONTENTS, "contents": _OTHER_CONTENTS, "scenes": "other scenes",
     "checkpoint": "other weights", "weights": "another adapter", "folder": "--adapter", "masks": "other masks",
     "command": "the command", "recipe": "--adapt", "name": "--recipe", "sets_per_scene": "--sets",
-    "adapting_precision": "--precision",
+    "adapting_precision": "--precision", "refinement": "--refine",
     **dict.fromkeys(("alpha", "first_seed", "distinct_seeds", "final_lr", "batch"), "what follows from the recipe"),
     **{
         name: f"--{name}"
@@ -47,6 +47,8 @@ FILES = {
     "report.html": "the page to look at first",
     npz.FORMAT.path: npz.FORMAT.about,
     "frozen/prediction.npz": "the same before adaptation",
+    "unrefined/prediction.npz": "the same before refinement",
+    TRACKS_NAME: "measured points of the refinement",
     KEPT_NAME: "which pixels the filters kept as points",
     "adapter": "the adapter (peft format)",
     **{format.path: format.about for format in FORMATS.values()},
@@ -75,6 +77,7 @@ def run_job(
     mixed: Mixed = MIXED,
     files: FileOptions = DEFAULT_FILES,
     guard: Guard = "select",
+    refine: Refine = "off",
     extra_settings: dict[str, Any] | None = None,
     after: Callable[[Job], None] = lambda job: None,
 ) -> None:
@@ -107,6 +110,7 @@ def run_job(
         **(extra_settings or {}),
         "adaptation": adaptation,
         "prediction": {"reference": model_options.reference or empty.spec.reference},
+        "refinement": refine,
         "filters": files.filter_settings(masks),
         "formats": formats,
     }
@@ -122,6 +126,7 @@ def run_job(
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), warnings=console.warned(), after=after, formats=formats, photos=photos,
             filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity, guard=guard,
+            refine=refine == "ba",
             scene=None if plan is None else lambda model: scene_images("photos", photos, model, plan, batch),
         )  # fmt: skip
         summary = job.run()
@@ -149,11 +154,29 @@ def say_finished(folder: Path, finished_at: str | None) -> None:
     console.say(f"{folder}: already finished on {finished_at}; nothing to do.")
 
 
+def say_answer(summary: dict[str, Any]) -> None:
+    """Print whether adaptation and refinement helped, the scores of that, and what to try where they did not."""
+    from freegeo.report.answer import HEADER, answer
+
+    found = answer(summary)
+    if found is None:
+        return
+    console.say("\nDid it help?")
+    for part in found.parts:
+        console.say(f"{part.what}: {part.outcome}. {part.sentence}")
+    if found.rows:
+        console.say(console.table(HEADER, found.rows))
+    if found.advice:
+        console.say("What to try next:")
+        for sentence in found.advice:
+            console.say(f"  {sentence}")
+    console.say()
+
+
 def describe(summary: dict[str, Any], folder: Path) -> None:
     """Print the outcome of a job."""
+    say_answer(summary)
     console.say(f"{len(summary['images'])} views at {summary['image_hw'][1]} x {summary['image_hw'][0]} pixels")
-    if summary["verdict"]:
-        console.say(summary["verdict"]["reason"])
     if summary["loss"]:
         first, last = summary["loss"]["first"], summary["loss"]["last"]
         console.say(f"adaptation loss {first:.4f} -> {last:.4f} (means of the first and last tenth of the steps)")

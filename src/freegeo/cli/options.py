@@ -19,6 +19,8 @@ from freegeo.errors import UserError
 from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL, entry, warn_of_embedded_model
 from freegeo.models.spec import MIXED, Mixed
 
+Refine = Literal["off", "ba"]
+"""What follows a prediction: nothing, or bundle adjustment of matches between the photos (docs/refinement.md)."""
 SMALL_MODEL = 20_000_000
 """Parameters below which a model runs on one CPU thread."""
 
@@ -143,6 +145,14 @@ def model_of_adapter(adapter: Path, model: str | None) -> str:
     return made_for
 
 
+def require_refinement(refine: Refine) -> None:
+    """Raise UserError when what a refinement needs is not installed; called before anything slow."""
+    if refine == "ba":
+        from freegeo.evidence.bundle import pycolmap_module
+
+        pycolmap_module()
+
+
 def use_few_threads(model: ReconstructionModel) -> None:
     """Run small models on one thread: their matrices are too small to share out, and waiting threads cost more."""
     import torch
@@ -175,7 +185,7 @@ class RecipeOptions:
     rank: int | None = None
     """Size of the adapter: rank of its matrices. Default: 32 (freegeo-tiny: 16)."""
     hold: float | None = None
-    """How strongly the answer from all photos is held where it was. Default: 0; try 1 where many photos get worse."""
+    """How strongly the answer from all photos is held where it was. Default: 1 with recipe scene, else 0."""
     loss: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     """Settings of the loss, such as weight_kq=0 or selection=topk,angle_weights=2,2,2; may be given several times."""
 

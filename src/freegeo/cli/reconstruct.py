@@ -6,7 +6,7 @@ from pathlib import Path
 
 from freegeo.cli.files import FileOptions
 from freegeo.cli.jobs import DEFAULT_FILES, run_job
-from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions
+from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, Refine, require_refinement
 from freegeo.cli.sources import load_source
 
 DEFAULT_MODEL, DEFAULT_PHOTOS = ModelOptions(), PhotoOptions()
@@ -19,6 +19,7 @@ def reconstruct(
     photos: PhotoOptions = DEFAULT_PHOTOS,
     files: FileOptions = DEFAULT_FILES,
     adapter: Path | None = None,
+    refine: Refine = "off",
 ) -> None:
     """Reconstruct photos; one photo is enough.
 
@@ -29,14 +30,19 @@ def reconstruct(
     adapter
         Folder of a saved adapter, or the output folder of a run; it decides the model. Without it the frozen
         model is used.
+    refine
+        ba: bring the cameras to the matches between the photos by bundle adjustment, where matches that had no part in
+        it then fit better (needs the extra: pip install 'freegeo[colmap]'); off.
     """
     from freegeo.adaptation.adapter_files import find_adapter
 
+    require_refinement(refine)
     if adapter is not None:
         adapter = find_adapter(adapter)
         model = model.for_adapter(adapter)
     found = load_source(sources, photos)
     model.warn_of_embedded(sources)
     run_job(
-        found, model, output, command="reconstruct", recipe=None, adapter=adapter, mixed=photos.mixed, files=files
+        found, model, output, command="reconstruct", recipe=None, adapter=adapter, mixed=photos.mixed, files=files,
+        refine=refine,
     )  # fmt: skip

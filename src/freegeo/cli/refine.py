@@ -8,7 +8,7 @@ from typing import Annotated
 from freegeo.cli import console
 from freegeo.cli.export import find_photos
 from freegeo.cli.files import FORMAT_NAMES, require_complete
-from freegeo.cli.jobs import FILES, say_finished
+from freegeo.cli.jobs import FILES, say_answer, say_finished
 from freegeo.cli.options import OutputOptions
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.base import DEFAULT_FORMATS
@@ -31,15 +31,14 @@ def refine(
         Folder that `run` or `reconstruct` wrote.
     """
     from freegeo.evidence.bundle import pycolmap_module
-    from freegeo.evidence.refinement import bring_depth
-    from freegeo.evidence.refinement import refine as refined_by
-    from freegeo.export.formats import check_formats, export, filter_reconstruction
-    from freegeo.export.kept import load_kept, load_masks, save_kept
+    from freegeo.export.formats import check_formats
+    from freegeo.export.kept import load_kept, load_masks
+    from freegeo.export.measured import save_tracks
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.files import read_json, write_json
-    from freegeo.guarded import scene_matches
     from freegeo.models.checkpoints import fingerprint
-    from freegeo.pipeline import MATCHES_NAME, PREDICTION_NAME, SUMMARY_NAME
+    from freegeo.pipeline import MATCHES_NAME, PREDICTION_NAME, SUMMARY_NAME, UNREFINED_FOLDER, write_files
+    from freegeo.refined import refine_by_photos
     from freegeo.report.page import write_report
     from freegeo.run_folder import run_folder
 
@@ -47,6 +46,8 @@ def refine(
     before = Reconstruction.load(source)
     names = check_formats(formats, before.names, has_cameras=before.has_cameras)
     summary = read_json(source / SUMMARY_NAME) if (source / SUMMARY_NAME).is_file() else {}
+    if (summary.get("refinement") or {}).get("accepted"):
+        raise UserError(f"{source}: is refined already.")
     photos = find_photos(before, source)
     if photos is None:
         raise UserError(f"{source}: its photos are not where they were, or have changed; matches need them.")
@@ -58,28 +59,25 @@ def refine(
         if folder.finished:
             say_finished(output.output, folder.finished_at)
             return
-        console.note("matches between the photos ...")
-        matches = scene_matches(photos, before, folder / MATCHES_NAME)
-        console.note("bundle adjustment ...")
-        found = refined_by(before, matches)
-        if not found.accepted:
-            raise FreeGeoError(f"{source}: not refined, nothing is written. {found.reason}")
-        after, _ = bring_depth(before, found)
-        after.save(folder.path)
-        known = load_kept(source, before.depth_z.shape)
-        masks = None if known is None else load_masks(source)
-        filtered = filter_reconstruction(after, masks=masks)
-        save_kept(folder.path, filtered, masks)
-        exported = export(after, folder.path, names, filtered=filtered, masks=masks, photos=photos)
+        console.note("matches between the photos, and bundle adjustment ...")
+        found = refine_by_photos(before, photos, store=folder / MATCHES_NAME)
+        if found.tracks is None:
+            raise FreeGeoError(f"{source}: not refined, nothing is written. {found.about['reason']}")
+        before.save(folder / UNREFINED_FOLDER)
+        save_tracks(folder.path, found.tracks)
+        found.result.save(folder.path)
+        masks = None if load_kept(source, before.depth_z.shape) is None else load_masks(source)
+        filters, failed = write_files(folder.path, found.result, names, masks=masks, photos=photos)
         told = {
-            "frozen_prediction": None, "filters": {"pixels": filtered[1].pixels, "removed": dict(filtered[1].removed)},
-            "not_written": dict(exported.failed), "command": console.command_line(), "verdict": None, "loss": None,
+            "frozen_prediction": None, "refinement": found.about, "not_written": dict(failed),
+            "filters": None if filters is None else {"pixels": filters.pixels, "removed": dict(filters.removed)},
+            "command": console.command_line(), "verdict": None, "loss": None, "rejected_adapter": None,
             "warnings": list(dict.fromkeys([*summary.get("warnings", []), *console.warned()])),
-            "refinement": {"source": str(source), "reason": found.reason, "probability": found.probability},
         }  # fmt: skip
-        write_json(folder / SUMMARY_NAME, {**summary, **told})
-        write_report(folder.path)
+        summary = {**summary, **told}
+        write_json(folder / SUMMARY_NAME, summary)
+        write_report(folder.path, photos=photos)
         folder.finish()
-    console.say(found.reason)
+    say_answer(summary)
     console.written(output.output, FILES)
-    require_complete(output.output, exported.failed)
+    require_complete(output.output, failed)

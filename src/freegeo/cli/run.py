@@ -5,7 +5,7 @@ from __future__ import annotations
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli.files import FileOptions
 from freegeo.cli.jobs import DEFAULT_FILES, run_job
-from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
+from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions, Refine, require_refinement
 from freegeo.cli.sources import load_source
 
 DEFAULT_RECIPE, DEFAULT_MODEL, DEFAULT_PHOTOS = RecipeOptions(), ModelOptions(), PhotoOptions()
@@ -20,6 +20,7 @@ def run(
     files: FileOptions = DEFAULT_FILES,
     adapt: bool = True,
     guard: Guard = "select",
+    refine: Refine = "off",
 ) -> None:
     """Reconstruct photos with a model adapted to them.
 
@@ -34,8 +35,14 @@ def run(
     guard
         select: matches between the photos decide whether and in which state the adapter is used; report: they are only
         asked; off.
+    refine
+        ba: bring the cameras to the matches by bundle adjustment, where matches that had no part in it then fit better
+        (needs the extra: pip install 'freegeo[colmap]'); off.
     """
+    require_refinement(refine)
     found = load_source(sources, photos)
     model.warn_of_embedded(sources)
     plan = recipe if adapt else None
-    run_job(found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files, guard=guard)
+    run_job(
+        found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files, guard=guard, refine=refine
+    )

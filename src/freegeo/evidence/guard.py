@@ -89,6 +89,16 @@ class Measurement:
         """Median over the pairs of their reprojection error, matching pixels; nan without evidence."""
         return _median(self.reprojection.values)
 
+    def as_dict(self) -> dict[str, float | None]:
+        """Return the scores as JSON-like values, with the number of matches; what is unknown is None."""
+        return {
+            "epipolar_px": _number(self.epipolar_px),
+            "reprojection_px": _number(self.reprojection_px),
+            "scale_drift": _number(self.drift),
+            "depth_agreement": _number(self.agreement),
+            "matches": int(self.epipolar.used.sum()),
+        }
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trial:
@@ -127,10 +137,10 @@ class Verdict:
             "outcome": self.outcome,
             "reason": self.reason,
             "pairs": self.pairs,
-            "frozen": _numbers(self.frozen),
+            "frozen": self.frozen.as_dict(),
             "trials": [
                 {
-                    "steps": trial.state.steps, "strength": trial.state.strength, **_numbers(trial.measured),
+                    "steps": trial.state.steps, "strength": trial.state.strength, **trial.measured.as_dict(),
                     "gain": _number(trial.gain), "probability": trial.probability, "veto": trial.veto,
                 }
                 for trial in self.trials
@@ -336,15 +346,6 @@ def _changes(before: Measurement, after: Measurement) -> str:
         f"epipolar error {before.epipolar_px:.2f} -> {after.epipolar_px:.2f} px, reprojection error "
         f"{before.reprojection_px:.2f} -> {after.reprojection_px:.2f} px"
     )
-
-
-def _numbers(measured: Measurement) -> dict[str, float | None]:
-    return {
-        "epipolar_px": _number(measured.epipolar_px),
-        "reprojection_px": _number(measured.reprojection_px),
-        "scale_drift": _number(measured.drift),
-        "depth_agreement": _number(measured.agreement),
-    }
 
 
 def _number(value: float) -> float | None:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.fusion.filtering import FilterReport
     from freegeo.fusion.points import PointCloud
+    from freegeo.fusion.tracks import Tracks
     from freegeo.types import PhotoLike
 
 logger = logging.getLogger(__name__)
@@ -27,6 +28,8 @@ logger = logging.getLogger(__name__)
 DEFAULT_FORMATS = ("ply", "glb")
 KEPT_NAME = "kept.npz"
 """File that says which pixels became points (`freegeo.export.kept`)."""
+TRACKS_NAME = "tracks.npz"
+"""File of points that were measured in the photos (`freegeo.export.measured`)."""
 MAX_TRACKS = 100_000
 """Default limit of the points of a COLMAP model."""
 
@@ -82,6 +85,8 @@ class Export:
     voxel: float | None
     photos: Sequence[PhotoLike] | None
     """The photos of the reconstruction, in its order; None when they are not at hand."""
+    tracks: Tracks | None
+    """Points that were measured in the photos; None: there are none."""
     seed: int
     written: dict[str, list[Path]] = field(default_factory=dict)
     """Files by the name of the format."""

@@ -2,8 +2,9 @@
 
 World and cameras have OpenCV axes in COLMAP too. Cameras are PINHOLE at the photos' resolution, one per photo; images
 carry the names of the copies (`freegeo.export.photos`); pixel centres are at 0.5 (`freegeo.export.pixels`). Every point
-has two or more observations. They are not measured in the photos but projected from the predicted points, so bundle
-adjustment reproduces the predicted cameras and cannot improve them; ``README.txt`` says so beside the model.
+has two or more observations. Those of a refined result are measured in the photos (`freegeo.export.measured`). Others
+are projected from the predicted points, so that bundle adjustment reproduces the predicted cameras and cannot improve
+them. ``README.txt`` beside the model says which kind it holds.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 FOLDER = Path("colmap") / "sparse" / "0"
-ABOUT = "COLMAP model; its tracks are projected, not measured"
-NOTICE = """freegeo wrote this COLMAP model from predicted depth and cameras.
+ABOUT = "COLMAP model; its README.txt says whether tracks are measured"
+NOTICE = """freegeo wrote this COLMAP model.
 
 sparse/0   cameras, images and points
 images     upright copies of the photos
@@ -39,9 +40,16 @@ images     upright copies of the photos
 Use the model with images/ (--image_path), not with the original photos: COLMAP and the trainers of Gaussian splats do
 not turn photos by their EXIF orientation, but these cameras are those of upright photos.
 
-The observations of the points are not measured in the photos. They are the predicted points, projected into the views
-that agree on them. Bundle adjustment of this model reproduces the predicted cameras and cannot improve them. To refine
-the cameras, match features in images/ (feature_extractor, a matcher, point_triangulator with this model), then adjust.
+"""
+PROJECTED = """Observations are re-projections of the prediction.
+They are not measured in the photos, but are the predicted points, projected into the views that agree on them.
+Bundle adjustment of this model reproduces the predicted cameras and cannot improve them. To refine the cameras, use the
+option --refine ba of freegeo, or match features in images/ (feature_extractor, a matcher, point_triangulator with this
+model) and adjust.
+"""
+MEASURED = """Observations are measured matches.
+Each is a place in a photo that was matched with the others of its point. The cameras were refined by bundle adjustment
+of these tracks; another adjustment can learn from them.
 """
 
 
@@ -119,24 +127,31 @@ def check(names: Sequence[str]) -> None:
 
 
 def _write(export: Export) -> list[Path]:
-    from freegeo.fusion.tracks import build_tracks
+    from freegeo.fusion.tracks import build_tracks, inside, thin_tracks
 
     export.require_pixels()
     r = export.reconstruction
     T_cam_world, K = r.cameras()
-    tracks = build_tracks(
-        r.depth_z, T_cam_world, K, r.images, export.keep, tolerance=export.tolerance, max_points=export.max_tracks,
-        seed=export.seed,
-    )  # fmt: skip
+    tracks, kind = export.tracks, MEASURED
+    if tracks is None:
+        kind = PROJECTED
+        tracks = build_tracks(
+            r.depth_z, T_cam_world, K, r.images, export.keep, tolerance=export.tolerance, max_points=export.max_tracks,
+            seed=export.seed,
+        )  # fmt: skip
+    else:
+        tracks = thin_tracks(tracks if export.masks is None else inside(tracks, export.masks), export.max_tracks)
     model = write_colmap(r, tracks, export.folder / FOLDER)
     root = export.folder / FOLDER.parts[0]
     copies = export.write_photos(root / photos.FOLDER)
     notice = root / "README.txt"
     with files.atomic_path(notice) as part:
-        part.write_text(NOTICE, encoding="utf-8")
+        part.write_text(NOTICE + kind, encoding="utf-8")
     logger.info(
-        "colmap: the model is about the upright photos in %s/%s, not the original ones. Its tracks are projected, not "
-        "measured, so bundle adjustment cannot improve it.", FOLDER.parts[0], photos.FOLDER,
+        "colmap: the model is about the upright photos in %s/%s, not the original ones. Its %s", FOLDER.parts[0],
+        photos.FOLDER,
+        "observations are measured matches." if kind is MEASURED else
+        "observations are re-projections of the prediction: bundle adjustment cannot improve it.",
     )  # fmt: skip
     return [*model, *copies, notice]
 

@@ -23,6 +23,7 @@ from freegeo.fusion.settings import MAX_POINTS, FilterSettings
 if TYPE_CHECKING:
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.fusion.filtering import FilterReport
+    from freegeo.fusion.tracks import Tracks
     from freegeo.types import PhotoLike
 
 logger = logging.getLogger(__name__)
@@ -97,6 +98,7 @@ def export(
     max_points: int | None = MAX_POINTS,
     max_tracks: int | None = MAX_TRACKS,
     voxel: float | None = None,
+    tracks: Tracks | None = None,
     seed: int = 0,
 ) -> Exported:
     """Write a reconstruction in several formats; one that has nothing to write is a warning and costs no other.
@@ -114,6 +116,7 @@ def export(
         max_points: of `points.ply` and `scene.glb`; None writes all.
         max_tracks: points of the COLMAP model; None writes all.
         voxel: voxel edge of the mesh in the reconstruction's units; default chosen from its resolution.
+        tracks: points that were measured in the photos, for the COLMAP model; None: it gets projected ones.
         seed: of the random choice of points.
 
     Raises:
@@ -142,6 +145,7 @@ def export(
         max_tracks=max_tracks,
         voxel=voxel,
         photos=photos,
+        tracks=tracks,
         seed=seed,
     )
     written: list[Path] = []

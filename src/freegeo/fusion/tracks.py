@@ -13,7 +13,7 @@ from freegeo.fusion.points import thin_points
 from freegeo.geometry.camera import project
 from freegeo.geometry.se3 import inverse, transform_points
 
-__all__ = ["Tracks", "build_tracks"]
+__all__ = ["Tracks", "build_tracks", "inside", "thin_tracks"]
 
 MAX_ERROR = 4.0
 """Largest reprojection error of an observation, in pixels of the depth maps."""
@@ -85,7 +85,7 @@ def build_tracks(
         part = _tracks_of(surfaces, source, others, lookups, starts, images, first, max_error)
         parts.append(part)
         first += len(part)
-    return _thinned(_joined(parts), max_points, seed)
+    return thin_tracks(_joined(parts), max_points, seed)
 
 
 def _candidates(keep: np.ndarray, max_points: int | None, seed: int) -> Tensor:
@@ -161,8 +161,20 @@ def _joined(parts: list[Tracks]) -> Tracks:
     return Tracks(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
-def _thinned(tracks: Tracks, max_points: int | None, seed: int) -> Tracks:
-    chosen = thin_points(np.arange(len(tracks)), max_points=max_points, seed=seed)
+def thin_tracks(tracks: Tracks, max_points: int | None, seed: int = 0) -> Tracks:
+    """Return a seeded random choice of at most `max_points` points with their observations; None keeps all."""
+    return _select(tracks, thin_points(np.arange(len(tracks)), max_points=max_points, seed=seed))
+
+
+def inside(tracks: Tracks, masks: np.ndarray) -> Tracks:
+    """Return the points all of whose observations fall on masks (S, H, W) bool, one for each view."""
+    height, width = masks.shape[1:]
+    column, row = np.clip(np.rint(tracks.pixel), 0, (width - 1, height - 1)).astype(np.int64).T
+    outside = tracks.point[~masks[tracks.view, row, column]]
+    return _select(tracks, np.setdiff1d(np.arange(len(tracks)), outside))
+
+
+def _select(tracks: Tracks, chosen: np.ndarray) -> Tracks:
     number = np.full(len(tracks), -1)
     number[chosen] = np.arange(len(chosen))
     point = number[tracks.point]

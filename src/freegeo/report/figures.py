@@ -22,7 +22,7 @@ INVALID_GREY = 128
 DEPTH_MAP, CONF_MAP, ERROR_MAP, CHANGE_MAP = "viridis_r", "cividis", "inferno", "RdBu_r"
 # Placeholders that the page's colours replace, so that one figure works in light and dark mode.
 _INK, _FAINT = "#010203", "#040506"
-_STAGE_INK = {"frozen": "#070809", "adapted": "#0a0b0c", "truth": "#0d0e0f"}
+_STAGE_INK = {"frozen": "#070809", "adapted": "#0a0b0c", "refined": "#101112", "truth": "#0d0e0f"}
 _PAGE_COLOURS = {
     _INK: "currentColor",
     _FAINT: "var(--line)",
@@ -88,10 +88,10 @@ def data_uri(image: np.ndarray, max_width: int = MAX_WIDTH) -> str:
 
 
 def loss_curve(curve: Sequence[Mapping[str, float]]) -> str:
-    """SVG of the adaptation loss over the steps: the total, and its two parts."""
+    """SVG of the adaptation loss over the steps: the total, and its parts."""
     with _figure(5.6, 2.9) as (fig, axes):
         steps = np.arange(1, len(curve) + 1)
-        for term, style in (("total", "-"), ("cross", "--"), ("intra", ":")):
+        for term, style in (("total", "-"), ("cross", "--"), ("intra", ":"), ("hold", "-.")):
             values = np.array([step.get(term, np.nan) for step in curve], dtype=float)
             if np.isfinite(values).any():
                 width = 1.8 if term == "total" else 1.1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,11 @@ import numpy as np
 from freegeo import files
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.report import figures
+from freegeo.report.answer import HEADER, NOTE, answer
+from freegeo.report.pairs import PairPicture, pair_pictures
 from freegeo.report.result import LABELS, Result, camera_difference, load_result
 from freegeo.report.scene3d import ERROR_LIMIT, MAX_KEPT, scene_data
+from freegeo.types import PhotoLike
 
 FILE_NAME = "report.html"
 TEMPLATE = "report.html.j2"
@@ -35,26 +38,30 @@ FILTER_TEXTS = {
 }
 
 
-def write_report(folder: Path, *, truth: Reconstruction | None = None) -> Path:
+def write_report(
+    folder: Path, *, truth: Reconstruction | None = None, photos: Sequence[PhotoLike] | None = None
+) -> Path:
     """Write `report.html` of a finished output folder.
 
     Args:
         folder: holds prediction.npz and, where there, reconstruction.json, frozen/, adapter/ and scores.json.
         truth: ground truth at the prediction's resolution, in any world frame; default: `truth/prediction.npz` of the
             folder, if there.
+        photos: of the result, in which matches are drawn; None: they are drawn in the images that the model read.
 
     Raises:
         UserError: no reconstruction there, or one of a newer format.
         FreeGeoError: a damaged file, or ground truth of another size.
     """
     result = load_result(Path(folder), truth=truth)
+    pairs = pair_pictures(result.folder, Reconstruction.load(result.folder), photos)
     path = result.folder / FILE_NAME
     with files.atomic_path(path) as part:
-        part.write_text(render(result), encoding="utf-8")
+        part.write_text(render(result, pairs), encoding="utf-8")
     return path
 
 
-def render(result: Result) -> str:
+def render(result: Result, pairs: Sequence[PairPicture] = ()) -> str:
     """The page as text; the template engine escapes values such as names of photos."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
@@ -67,7 +74,10 @@ def render(result: Result) -> str:
     return environment.get_template(TEMPLATE).render(
         title=result.folder.resolve().name,
         facts=facts(result),
-        verdict=verdict_table(result.summary.get("verdict")),
+        answer=answer(result.summary),
+        answer_header=HEADER,
+        answer_note=NOTE,
+        pairs=pairs,
         warnings=list(result.summary.get("warnings") or []),
         stages=[{"key": s.key, "label": s.label} for s in result.stages.values()],
         predictions=[{"key": s.key, "label": s.label} for s in result.predictions],
@@ -97,7 +107,8 @@ def render(result: Result) -> str:
 
 FILES = (
     "points.ply", "scene.glb", "mesh.ply", "colmap", "transforms.json", "depth", "prediction.npz",
-    "frozen/prediction.npz", "kept.npz", "adapter", "reconstruction.json",
+    "frozen/prediction.npz", "unrefined/prediction.npz", "kept.npz", "tracks.npz", "matches.npz", "adapter",
+    "reconstruction.json",
 )  # fmt: skip
 
 
@@ -135,8 +146,8 @@ def _maps(result: Result, view: int, depth_range: Range, conf_range: Range) -> I
     for stage in result.stages.values():
         depth = figures.log_colours(stage.depth_z[view], depth_range, figures.DEPTH_MAP)
         yield f"depth {stage.key}", f"depth, {stage.label}", depth
-    if len(result.predictions) == 2:
-        before, after = (stage.depth_z[view] for stage in result.predictions)
+    if len(result.predictions) > 1:
+        before, after = (result.predictions[k].depth_z[view] for k in (0, -1))
         yield "depth", "change of depth", change_map(before, after)
     for stage in result.predictions:
         if stage.error is not None:
@@ -165,7 +176,7 @@ def legends(result: Result) -> list[dict[str, str]]:
     depth_range, conf_range = map_ranges(result)
     found = [_legend("depth", f"{depth_range[0]:.3g}", f"{depth_range[1]:.3g}", figures.DEPTH_MAP)]
     found.append(_legend("confidence", f"{conf_range[0]:.3g}", f"{conf_range[1]:.3g}", figures.CONF_MAP))
-    if len(result.predictions) == 2:
+    if len(result.predictions) > 1:
         limit = _percent(CHANGE_LIMIT, 0)
         found.append(_legend("change", f"{limit} nearer", f"{limit} farther", figures.CHANGE_MAP))
     if result.truth is not None:
@@ -188,8 +199,9 @@ def camera_rows(result: Result) -> list[tuple[str, str, str]]:
     if not result.has_cameras:
         return []
     pairs = [(s, result.truth, f"{s.label}, from ground truth") for s in result.predictions if result.truth]
-    if not pairs and len(result.predictions) == 2:
-        pairs = [(result.predictions[1], result.predictions[0], "adapted, from frozen")]
+    if not pairs:
+        first, *others = result.predictions
+        pairs = [(stage, first, f"{stage.label}, from {first.label}") for stage in others]
     rows = []
     for stage, reference, name in pairs:
         assert reference is not None
@@ -224,31 +236,6 @@ def score_table(scores: Mapping[str, Any]) -> dict[str, Any] | None:
     except (StopIteration, KeyError, IndexError, TypeError, AttributeError):
         return None
     return {"header": ("views", "model", *(SCORE_LABELS[key] for key in keys)), "rows": rows}
-
-
-def verdict_table(verdict: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """The guard's verdict: its sentence, and rows for the frozen model, the whole adapter and the chosen state."""
-    if not verdict:
-        return None
-    trials, chosen = verdict["trials"], verdict["chosen"]
-    rows = [("frozen", *_scores(verdict["frozen"]), "")] if trials else []
-    for number, trial in enumerate(trials):
-        whole = trial["steps"] == trial["strength"] == 1
-        if whole or number == chosen:
-            label = (
-                "adapted" if whole else f"adapted, strength {trial['strength']:g}, {100 * trial['steps']:g} % of steps"
-            )
-            named = f"{label} (chosen)" if number == chosen else label
-            rows.append((named, *_scores(trial), f"{100 * trial['probability']:.0f} %"))
-    return {"outcome": verdict["outcome"], "reason": verdict["reason"], "pairs": verdict["pairs"], "rows": rows}
-
-
-def _scores(numbers: Mapping[str, float | None]) -> tuple[str, ...]:
-    formats = (
-        ("epipolar_px", "{:.2f} px"), ("reprojection_px", "{:.2f} px"), ("depth_agreement", "{:.1%}"),
-        ("scale_drift", "{:.1%}"),
-    )  # fmt: skip
-    return tuple("–" if numbers[name] is None else text.format(numbers[name]) for name, text in formats)
 
 
 def filter_tables(result: Result) -> list[dict[str, Any]]:

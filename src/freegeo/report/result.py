@@ -1,7 +1,7 @@
 """The reconstructions of an output folder, moved into one world frame and scale for comparison.
 
-A model before and after adaptation gives two reconstructions, each with its own world frame and scale. With ground
-truth both are moved onto it, otherwise the one before onto the one after.
+A model before and after adaptation gives two reconstructions, each with its own world frame and scale, and refinement a
+third. With ground truth all are moved onto it, otherwise those before onto the result.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from freegeo.geometry.se3 import camera_centres
 from freegeo.geometry.sim3 import Sim3
 
 SUMMARY_NAME, SCORES_NAME = "reconstruction.json", "scores.json"
-FROZEN_FOLDER, TRUTH_FOLDER, ADAPTER_PAGE = "frozen", "truth", "adapter/freegeo.json"
-LABELS = {"frozen": "frozen", "adapted": "adapted", "truth": "ground truth"}
+FROZEN_FOLDER, UNREFINED_FOLDER, TRUTH_FOLDER = "frozen", "unrefined", "truth"
+ADAPTER_PAGE = "adapter/freegeo.json"
+LABELS = {"frozen": "frozen", "adapted": "adapted", "refined": "refined", "truth": "ground truth"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +35,7 @@ class Stage:
     """One reconstruction in the common frame and scale."""
 
     key: str
-    """`frozen`, `adapted` or `truth`."""
+    """`frozen`, `adapted`, `refined` or `truth`."""
     depth_z: np.ndarray
     """(S, H, W) float32."""
     conf: np.ndarray
@@ -75,7 +76,7 @@ class Result:
     scores: Mapping[str, Any]
     """Content of scores.json; empty when there is none."""
     stages: Mapping[str, Stage]
-    """Those that exist, in the order frozen, adapted, truth."""
+    """Those that exist, in the order frozen, adapted, refined, truth."""
     names: Sequence[str]
     images: np.ndarray
     """(S, H, W, 3) uint8, what the model read."""
@@ -89,7 +90,7 @@ class Result:
 
     @property
     def final(self) -> Stage:
-        """The stage that was exported: adapted where there is an adapter, else frozen."""
+        """The stage that was exported, the last one."""
         return self.predictions[-1]
 
     @property
@@ -121,19 +122,15 @@ def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
     if summary.get("format", FORMAT) > FORMAT:
         raise UserError(f"{folder}: written by a newer freegeo (format {summary['format']}). Update freegeo.")
     final = Reconstruction.load(folder)
-    found = {"adapted" if summary.get("adapter") else "frozen": final}
-    if (folder / FROZEN_FOLDER / FILE_NAME).is_file() and not summary.get("rejected_adapter"):
-        found = {"frozen": Reconstruction.load(folder / FROZEN_FOLDER), "adapted": final}
+    places = _places(folder, summary)
+    found = {key: final if place == folder else Reconstruction.load(place) for key, place in places.items()}
     if truth is None and (folder / TRUTH_FOLDER / FILE_NAME).is_file():
         truth = Reconstruction.load(folder / TRUTH_FOLDER)
     for other in (*found.values(), *([truth] if truth else [])):
         if other.depth_z.shape != final.depth_z.shape:
             raise FreeGeoError(f"{folder}: reconstructions of different sizes cannot be compared. Run again.")
     reference = truth or final
-    stages = {
-        key: _stage(key, value, reference, truth, folder if value is final else folder / FROZEN_FOLDER)
-        for key, value in found.items()
-    }
+    stages = {key: _stage(key, value, reference, truth, places[key]) for key, value in found.items()}
     if truth is not None:
         stages["truth"] = _truth_stage(truth)
     return Result(
@@ -146,6 +143,19 @@ def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
         images=final.images,
         from_own_frame=align(final, reference) if final.has_cameras and reference.has_cameras else None,
     )
+
+
+def _places(folder: Path, summary: Mapping[str, Any]) -> dict[str, Path]:
+    """Return the folder of each prediction to show, the result's last."""
+    frozen, unrefined = folder / FROZEN_FOLDER, folder / UNREFINED_FOLDER
+    refined = bool((summary.get("refinement") or {}).get("accepted"))
+    found = {}
+    if (frozen / FILE_NAME).is_file() and (refined or not summary.get("rejected_adapter")):
+        found["frozen"] = frozen
+    if refined and (unrefined / FILE_NAME).is_file():
+        found["adapted" if summary.get("adapter") else "frozen"] = unrefined
+    last = "refined" if refined else "adapted" if summary.get("adapter") or found else "frozen"
+    return {**found, last: folder}
 
 
 def moved(result: Result, onto: Stage) -> Result:

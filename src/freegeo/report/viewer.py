@@ -21,6 +21,7 @@ import torch
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.mesh import FILE_NAME as MESH_NAME
 from freegeo.geometry.rotation import matrix_to_quat_xyzw, quat_xyzw_to_wxyz
+from freegeo.report.answer import answer
 from freegeo.report.figures import CONF_MAP, DEPTH_MAP, ERROR_MAP, linear_colours, log_colours, log_range
 from freegeo.report.result import Result, Stage, load_result, moved
 from freegeo.report.scene3d import ERROR_LIMIT, level_rotation
@@ -33,7 +34,9 @@ MAX_POINTS = 600_000
 """Most points of one stage that are sent to the browser; of more, a seeded choice."""
 THUMBNAIL_WIDTH = 240
 FRUSTUM_SHARE = 0.06
-STAGE_COLOURS = {"frozen": (214, 122, 32), "adapted": (42, 124, 204), "truth": (64, 160, 92)}
+STAGE_COLOURS = {
+    "frozen": (214, 122, 32), "adapted": (42, 124, 204), "refined": (150, 70, 190), "truth": (64, 160, 92),
+}  # fmt: skip
 SCREENSHOT_HW = (1080, 1920)
 OUTSIDE = "outside"
 MODES = ("photo", "depth", "confidence", "error")
@@ -72,6 +75,11 @@ class Viewer:
         }
         for layer in self.layers:
             self._add(layer, ranges)
+        for result in results:
+            text = answer_text(result)
+            if text is not None:
+                with self.server.gui.add_folder("Did it help?" if len(results) == 1 else result.folder.resolve().name):
+                    self.server.gui.add_markdown(text)
         self._add_controls()
         self._apply()
 
@@ -134,9 +142,7 @@ class Viewer:
         labels = [layer.label for layer in self.layers]
         final = next(layer.label for layer in self.layers if layer.stage is layer.result.final)
         self.shown = gui.add_dropdown("Shown", labels, initial_value=final)
-        self.swap = gui.add_button(
-            "Swap frozen / adapted", disabled=len({layer.stage.key for layer in self.layers}) < 2
-        )
+        self.swap = gui.add_button("Swap before / after", disabled=len({layer.stage.key for layer in self.layers}) < 2)
         modes = [m for m in MODES if all(m in colours for colours in self.colours.values())]
         self.mode = gui.add_dropdown("Colour", modes, initial_value="photo")
         self.hidden = gui.add_slider("Hide least confident %", 0, 95, 5, 0)
@@ -183,11 +189,10 @@ class Viewer:
                     handle.colors = colours
 
     def _swap(self) -> None:
-        """Show the other prediction of the same folder."""
+        """Show the next prediction of the same folder."""
         now = self._layer()
-        others = [x for x in self.layers if x.result is now.result and x.stage.key != "truth" and x is not now]
-        if others:
-            self.shown.value = others[0].label
+        own = [x for x in self.layers if x.result is now.result and (x.stage.key != "truth" or x is now)]
+        self.shown.value = own[(own.index(now) + 1) % len(own)].label
 
     def _set_follow(self, view: int) -> None:
         self.follow.value = self.follow.options[view + 1]
@@ -264,6 +269,19 @@ def require_free_port(host: str, port: int) -> None:
         raise UserError(
             f"port {port} on {host} cannot be used ({error.strerror}). Choose another with --port."
         ) from None
+
+
+def answer_text(result: Result) -> str | None:
+    """Whether adaptation and refinement helped, as Markdown for the panel; None where neither was done."""
+    found = answer(result.summary)
+    if found is None:
+        return None
+    lines = [f"**{part.what}: {part.outcome}.** {part.sentence}" for part in found.parts]
+    lines += [
+        f"**{name}**: epipolar error {epipolar} px, contradicted pixels {contradicted} %, {matches} matches"
+        for name, epipolar, _, contradicted, matches, _ in found.rows
+    ]
+    return "\n\n".join(lines + [f"Try: {sentence}" for sentence in found.advice])
 
 
 def field_of_view(stage: Stage, view: int) -> float:

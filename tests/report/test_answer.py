@@ -1,0 +1,109 @@
+"""Did it help? The answer follows the verdicts, marks what is used, and says what to try where it is not yes."""
+
+import pytest
+
+from freegeo.report.answer import HEADER, LACKING, OVERLAP, answer
+
+SCORES = {"epipolar_px": 2.0, "reprojection_px": 3.0, "scale_drift": 0.01, "depth_agreement": 0.9, "matches": 1200}
+WHOLE = {**SCORES, "steps": 1.0, "strength": 1.0, "probability": 0.4, "gain": 0.1, "veto": None}
+HALF = {**WHOLE, "strength": 0.5, "probability": 0.95, "epipolar_px": 1.5}
+RECIPE = {"hold": 1.0, "steps": 100, "lr": 3e-5}
+NOTHING = {"matches": 0} | dict.fromkeys(("epipolar_px", "reprojection_px", "scale_drift", "depth_agreement"))
+
+
+def summary(**changes):
+    return {
+        "recipe": RECIPE, "verdict": None, "refinement": None, "adapter": None, "rejected_adapter": None,
+        "filters": {"pixels": 1}, **changes,
+    }  # fmt: skip
+
+
+def verdict(outcome, trials=(WHOLE, HALF), chosen=None, reason="Because."):
+    frozen = SCORES if trials else NOTHING
+    return {"outcome": outcome, "reason": reason, "pairs": 9, "frozen": frozen, "trials": trials, "chosen": chosen}
+
+
+def refinement(accepted, **changes):
+    after = {**SCORES, "epipolar_px": 0.1}
+    return {
+        "accepted": accepted, "reason": "Refined so.", "lacking": None if accepted else "proof", "probability": 0.97,
+        "pairs": 9, "frozen": None, "before": SCORES, "after": after, **changes,
+    }  # fmt: skip
+
+
+def test_nothing_was_asked_of_a_plain_reconstruction():
+    assert answer({}) is None
+    assert answer(summary(recipe=None)) is None
+
+
+def rows(found):
+    assert all(len(row) == len(HEADER) for row in found.rows)
+    return [row[0] for row in found.rows]
+
+
+def test_an_adapter_that_helped_needs_no_advice():
+    found = answer(summary(verdict=verdict("adapted", chosen=1), adapter="adapter"))
+    assert [(part.what, part.outcome, part.sentence) for part in found.parts] == [("Adaptation", "yes", "Because.")]
+    assert rows(found) == ["frozen", "adapted", "adapted, strength 0.5, 100 % of steps (used)"]
+    assert found.rows[-1][1:] == ("1.50", "3.00", "10.0", "1,200", "95")
+    assert found.advice == ()
+
+
+def test_an_adapter_that_did_not_help_is_not_used():
+    found = answer(summary(verdict=verdict("frozen"), rejected_adapter="Because."))
+    assert found.parts[0].outcome == "no"
+    assert rows(found) == ["frozen (used)", "adapted"]
+    text = " ".join(found.advice)
+    assert "--refine ba" in text and "--steps (now 100)" in text and "--hold" not in text
+    free = answer(summary(verdict=verdict("frozen"), recipe={**RECIPE, "hold": 0.0}, refinement=refinement(True)))
+    assert "--hold 1 (now 0)" in " ".join(free.advice) and "--refine" not in " ".join(free.advice)
+
+
+def test_a_reported_verdict_leaves_the_adapter_in_use():
+    reported = verdict("frozen", reason="Worse. The adapter is used as it was trained (--guard report).")
+    assert rows(answer(summary(verdict=reported, adapter="adapter"))) == ["frozen", "adapted (used)"]
+
+
+def test_too_few_matches_ask_for_more_overlap():
+    found = answer(summary(verdict=verdict("unknown", ())))
+    assert (found.parts[0].outcome, found.rows, found.advice) == ("unknown", (), (OVERLAP,))
+
+
+@pytest.mark.parametrize(
+    ("changes", "outcome", "words"),
+    [
+        ({"rejected_adapter": "the loss grew.", "verdict": None}, "no", "The loss grew."),
+        ({"rejected_adapter": "no numbers.", "verdict": verdict("adapted", chosen=0)}, "no", "No numbers."),
+        ({"adapter": "adapter"}, "unknown", "not asked (--guard off)"),
+        ({"adapter": "adapter", "filters": None}, "unknown", "predicts no cameras"),
+    ],
+)
+def test_without_a_verdict_the_reason_is_told(changes, outcome, words):
+    (part,) = answer(summary(**changes)).parts
+    assert part.outcome == outcome and words in part.sentence
+
+
+def test_a_refined_result_is_the_one_in_use():
+    found = answer(summary(verdict=verdict("adapted", chosen=0), adapter="adapter", refinement=refinement(True)))
+    assert [part.outcome for part in found.parts] == ["yes", "yes"]
+    assert rows(found) == ["frozen", "adapted", "refined (used)"]
+    assert found.rows[-1][1] == "0.10"
+    assert rows(answer(summary(recipe=None, refinement=refinement(True)))) == ["frozen", "refined (used)"]
+    saved = answer(summary(recipe=None, adapter="a/", refinement=refinement(True, frozen=None)))
+    assert rows(saved) == ["adapted", "refined (used)"]
+
+
+def test_depth_that_contradicts_itself_more_is_said():
+    worse = refinement(True, after={**SCORES, "depth_agreement": 0.8})
+    told = answer(summary(recipe=None, refinement=worse)).parts[0].sentence
+    assert told.endswith("in 20 % of the pixels instead of 10 %: they are less exact than the cameras.")
+    assert answer(summary(recipe=None, refinement=refinement(True))).parts[0].sentence == "Refined so."
+
+
+@pytest.mark.parametrize("lacking", LACKING)
+def test_a_refused_refinement_changes_nothing_and_says_what_it_lacks(lacking):
+    after = {"epipolar_px": 1.9} if lacking == "proof" else None
+    found = answer(summary(recipe=None, refinement=refinement(False, lacking=lacking, after=after)))
+    assert found.parts[0].outcome == "no" and "stay as they were predicted" in found.parts[0].sentence
+    assert rows(found) == ["frozen (used)", "refined, refused"][: 2 if after else 1]
+    assert found.advice == (LACKING[lacking],)
