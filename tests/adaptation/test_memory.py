@@ -9,10 +9,10 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from freegeo.adaptation import memory
-from freegeo.adaptation.adapt import adapt
+from freegeo.adaptation.adapt import adapt, visited
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.memory import Footprint, plan_adaptation, plan_reconstruction, shape_of
-from freegeo.adaptation.recipe import paper, scene
+from freegeo.adaptation.recipe import named, paper, scene
 from freegeo.adaptation.samples import Samples, SceneImages
 from freegeo.adaptation.views import schedule
 from freegeo.errors import UserError
@@ -245,6 +245,54 @@ def test_reconstruction_says_how_many_views_fit():
         plan_reconstruction(model, fitting + 1, (504, 378), compute=compute, budget=16 * GB)
     with pytest.raises(UserError, match="smaller model"):
         plan_reconstruction(model, 4, (504, 378), compute=compute, budget=2 * GB)
+
+
+@pytest.mark.parametrize("build", [tiny_da3, tiny_vggt])
+def test_an_adapter_that_is_on_does_not_change_a_model_s_shape(build):
+    model = build()
+    before = shape_of(model)
+    Adapter.attach(model, rank=2, alpha=2, dropout=0.0, generator=torch.Generator())
+    assert shape_of(model) == before
+
+
+MEASURED_GB = [
+    # model, recipe, images, place, checkpointing, hold, measured peak (benchmarks/results/gpu-steps.json)
+    ("da3-giant", "released-da3", (518, 518), "device", False, 0.0, 24.01),
+    ("da3-giant", "released-da3", (518, 518), "device", True, 0.0, 9.49),
+    ("da3-giant", "released-da3", (378, 504), "device", False, 0.0, 19.27),
+    ("da3-giant", "released-da3", (518, 518), "device", False, 1.0, 40.21),
+    ("da3-giant", "paper", (518, 518), "device", False, 0.0, 22.57),
+    ("vggt-1b", "released-vggt", (518, 518), "device", False, 0.0, 23.72),
+    ("vggt-1b", "released-vggt", (518, 518), "disk", True, 0.0, 7.33),
+    ("da3-base", "released-da3", (518, 518), "device", False, 0.0, 4.16),
+    ("da3-base", "released-da3", (378, 504), "device", False, 0.0, 3.26),
+]
+
+
+@pytest.mark.parametrize(("name", "recipe", "image_hw", "place", "checkpointing", "hold", "peak"), MEASURED_GB)
+def test_the_peak_agrees_with_what_a_gpu_measured(name, recipe, image_hw, place, checkpointing, hold, peak):
+    model = build_empty(name)
+    once = {"sets_per_scene": 1, "distinct_seeds": 1, "batch": 1, "epochs": 2, "redraw": False, "hold": hold}
+    recipe = named(recipe, model.spec, "eth3d").changed(**once)
+    scenes = [SceneImages(name="", count=8, load=lambda f: torch.empty(len(f), 3, *image_hw, device="meta"))] * 4
+    compute = Compute(device=CUDA, precision="bf16")
+    job = Footprint(model, scenes, recipe, visited(schedule([8] * 4, recipe, 42)), compute)
+    assert job.plan(place, checkpointing).peak_bytes / GB == pytest.approx(peak, rel=0.13)
+
+
+RECONSTRUCTION_GB = {
+    ("da3-giant", 8): 8.42, ("da3-giant", 32): 10.89, ("da3-giant", 100): 20.13,
+    ("vggt-1b", 8): 7.32, ("vggt-1b", 32): 8.22, ("vggt-1b", 100): 12.31,
+    ("da3-base", 8): 2.41, ("da3-base", 32): 3.66, ("da3-base", 100): 8.07,
+}  # fmt: skip
+"""Peaks of 504 x 378 pixels in bf16 (benchmarks/results/gpu-reconstruct.json)."""
+
+
+@pytest.mark.parametrize(("name", "views"), RECONSTRUCTION_GB)
+def test_reconstruction_s_peak_agrees_with_what_a_gpu_measured(name, views):
+    compute = Compute(device=CUDA, precision="bf16")
+    parts, _ = plan_reconstruction(build_empty(name), views, (378, 504), compute=compute, budget=80 * GB)
+    assert sum(size for _, size in parts) / GB == pytest.approx(RECONSTRUCTION_GB[name, views], rel=0.15)
 
 
 @pytest.mark.parametrize("build", [tiny_da3, tiny_vggt])

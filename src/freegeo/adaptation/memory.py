@@ -228,12 +228,16 @@ class Shape:
     hidden: int
     """Width between the two linears of the feed-forward layer."""
     gated: bool
+    query_key_norm: bool
+    """Whether queries and keys go through norms of their own."""
     parameters: int
     adapted_parameters: int
     """Parameters of the linears that an adapter sits on."""
     channels: int
     """Feature channels of the losses."""
     special: int
+    feature_copies: int
+    """Copies of the features that `aggregate` makes."""
 
     def saved_per_token(self, compute: Compute, *, rank: int, dropout: bool) -> int:
         """Bytes that one adapted block keeps per token from the forward to the backward pass."""
@@ -244,7 +248,9 @@ class Shape:
         attention = 6 * e * d
         feed_forward = 3 * e * h if self.gated else e * h
         statistics = WIDE * (4 + 5 * heads)
-        total = norm_inputs + lora_inputs + attention + feed_forward + statistics + 4 * rank * e
+        # CUDA's autocast runs norms in float32 and keeps their inputs so; on the CPU they stay views of qkv.
+        query_and_key = 2 * WIDE * d if self.query_key_norm and e < WIDE and compute.device.type == "cuda" else 0
+        total = norm_inputs + lora_inputs + attention + query_and_key + feed_forward + statistics + 4 * rank * e
         # A dropout mask is one byte per element in CUDA's fused dropout and in ours on the CPU, elsewhere a float.
         return total + (3 * d + h) * ((WIDE if compute.device.type == "mps" else 1) if dropout else 0)
 
@@ -256,8 +262,8 @@ class Shape:
         return 3 * WIDE * d + e * (d + inner) + low_rank
 
     def features(self, tokens: int, layers: int) -> int:
-        """Bytes of the features of `layers` layers in `aggregate`: the joined halves, and the normalised copy."""
-        return 2 * WIDE * layers * tokens * self.channels
+        """Bytes of the features of `layers` layers in `aggregate`: the joined halves, and copies of them."""
+        return (1 + self.feature_copies) * WIDE * layers * tokens * self.channels
 
     def half_copies(self, compute: Compute) -> int:
         """Bytes of the half-precision copies of the adapted weights, which autocast makes for every pass."""
@@ -271,7 +277,9 @@ class Shape:
 def shape_of(model: ReconstructionModel) -> Shape:
     """Read a model's shape off its adapter targets; the model may be on the meta device, and may carry an adapter."""
     part = model.adaptable()
-    linears = [_base(part.get_submodule(name)) for name in part.adapter_targets()]
+    # The layers of an adapter that is on are linears, too.
+    names = [name for name in part.adapter_targets() if ".lora_" not in name]
+    linears = [_base(part.get_submodule(name)) for name in names]
     attention = [linear for linear in linears if linear.out_features == 3 * linear.in_features]
     # A third-party model may have no joint qkv layer; then the width is taken from its first layer.
     width = (attention or linears)[0].in_features
@@ -283,11 +291,15 @@ def shape_of(model: ReconstructionModel) -> Shape:
         blocks=max(1, len(attention)),
         hidden=hidden,
         gated=any(linear.out_features == 2 * hidden for linear in expansion),
+        query_key_norm=any(
+            name.endswith("q_norm") and not isinstance(module, nn.Identity) for name, module in part.named_modules()
+        ),
         parameters=sum(p.numel() for name, p in model.named_parameters() if ".lora_" not in name),
         adapted_parameters=sum(linear.weight.numel() for linear in linears),
         # Both families concatenate the outputs of two blocks.
         channels=2 * width,
         special=part.spec.special_tokens,
+        feature_copies=part.feature_copies,
     )
 
 
@@ -317,9 +329,10 @@ def plan_reconstruction(
     pixels = math.prod(image_hw)
     per_view = (image_hw[0] // spec.patch_size) * (image_hw[1] // spec.patch_size) + shape.special
     maps = 2 * WIDE * pixels  # depth and confidence
-    # Widest moment of the dense head per view: its last maps at image size, and the fused pyramid at 8 per patch.
+    # Widest moment of the dense head per view: half of its channels and its last layers at image size, and three maps
+    # of all channels at 8 per patch.
     head = getattr(getattr(model.adaptable(), "config", None), "head_features", 256)
-    head_bytes = int(WIDE * pixels * (head + 64 + 3 * head * (8 / spec.patch_size) ** 2))
+    head_bytes = int(WIDE * pixels * (head / 2 + 48 + 3 * head * (8 / spec.patch_size) ** 2))
     passing, copies = shape.passing(compute, with_adapter=False), shape.half_copies(compute)
 
     def parts(count: int) -> Parts:

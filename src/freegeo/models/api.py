@@ -29,6 +29,9 @@ class ReconstructionModel(nn.Module, ABC):
     published_adapter_root: str = ""
     """Module that adapter files of the method's authors name layers relative to; empty: the model itself."""
 
+    feature_copies: int = 1
+    """Copies of all features that `aggregate` makes, such as normalised ones; the memory planner counts them."""
+
     @abstractmethod
     def preprocess(self, photos: Sequence[PhotoLike], *, mixed: Mixed = MIXED) -> ImageBatch:
         """Resize photos as the model was trained, to one size by the rule `mixed`; UserError for an unusable photo."""

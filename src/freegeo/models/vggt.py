@@ -158,6 +158,8 @@ class CameraHead(nn.Module):
 class VGGT(ReconstructionModel):
     """Visual geometry grounded transformer for any number of views; the first view is the reference."""
 
+    feature_copies = 0
+
     def __init__(self, config: VGGTConfig, spec: ModelSpec):
         super().__init__()
         self.config, self.spec = config, spec
