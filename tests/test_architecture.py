@@ -14,7 +14,7 @@ ALLOWED = {
         *("guarded", "refined"),
     },
     "guarded": {"adaptation", "evidence", "export"},
-    "refined": {"evidence", "export", "fusion", "guarded"},
+    "refined": {"data", "evidence", "export", "fusion", "guarded", "models"},
     "progress": {"adaptation"},
     "benchmark": {"adaptation", "models", "data", "fusion", "metrics", "geometry"},
     "training": {"models", "data", "metrics", "geometry"},

@@ -15,6 +15,7 @@ _HOMES = {
     "load_photos": "freegeo.data.photos",
     "adapt": "freegeo.pipeline",
     "reconstruct": "freegeo.pipeline",
+    "refine": "freegeo.refined",
     "load_adapter": "freegeo.pipeline",
     "open_reconstruction": "freegeo.export.reconstruction",
     "evaluate": "freegeo.metrics.scene",

@@ -1,21 +1,29 @@
-"""A prediction refined by the photos, for `run`, `reconstruct` and `refine` alike (docs/refinement.md)."""
+"""A prediction refined by the photos, for the commands and for Python alike (docs/refinement.md)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from freegeo.data.photos import MAX_VIEWS, load_photos
+from freegeo.errors import UserError
+from freegeo.evidence import refinement
+from freegeo.evidence.bundle import pycolmap_module
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.guard import Reference
-from freegeo.evidence.refinement import Refinement, bring_depth, refine
+from freegeo.evidence.refinement import Refinement, bring_depth
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.fusion.tracks import Tracks
 from freegeo.guarded import scene_matches
+from freegeo.models.precision import choose_device
 from freegeo.types import PhotoLike
+
+if TYPE_CHECKING:
+    from freegeo.data.photos import PhotoSource
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,6 +39,39 @@ class Refined:
     `fit` of matches and prediction, or `proof` by held-out pairs), `probability`, `pairs`, and scores `frozen`,
     `before`, `after` as `Measurement.as_dict`. The epipolar error of `after` is that of pairs that had no part in the
     adjustment."""
+
+
+def refine(
+    reconstruction: Reconstruction,
+    photos: PhotoSource,
+    *,
+    frozen: Reconstruction | None = None,
+    device: str | None = None,
+    max_views: int = MAX_VIEWS,
+) -> Refined:
+    """Bring a reconstruction's cameras to the matches between its photos by bundle adjustment, and its depth to them.
+
+    `about["accepted"]` of what comes back says whether matches that had no part in it fit better then, and
+    `about["reason"]` why or why not; a refused refinement leaves the reconstruction as it was. Needs extra `colmap`.
+
+    Args:
+        reconstruction: of the frozen or of an adapted model.
+        photos: those that it was made from; what `freegeo.load_photos` takes or returned.
+        frozen: reconstruction by the frozen model where the other one is that of an adapted model.
+        device: where depth maps are compared; None: the best available.
+        max_views: as it was given to `freegeo.reconstruct`.
+
+    Raises:
+        UserError: photos of another reconstruction, or no pycolmap.
+    """
+    pycolmap_module()
+    found = load_photos(photos, max_views)
+    if [photo.name for photo in found] != list(reconstruction.names):
+        raise UserError(
+            f"the {len(found)} photos are not those of the reconstruction, which has {len(reconstruction)} views "
+            f"(first: {reconstruction.names[0]}). Give the same photos in the same order."
+        )
+    return refine_by_photos(reconstruction, found, frozen=frozen, device=str(choose_device(device)))
 
 
 def refine_by_photos(
@@ -55,7 +96,7 @@ def refine_by_photos(
         return _refused(prediction, "The model predicts no cameras, so there are none to refine.")
     base = frozen or prediction
     matches = scene_matches(photos, base, store, device=device)
-    found = refine(prediction, matches)
+    found = refinement.refine(prediction, matches)
     if not len(matches.pairs):
         return _refused(prediction, found.reason)
     reference = Reference.of(Candidate.of(base, device), matches)

@@ -148,3 +148,13 @@ def test_a_missing_extra_is_said_before_the_photos_are_read(freegeo, tmp_path, m
     outcome = freegeo(command, tmp_path / "no photos", "-o", tmp_path / "out", "--refine", "ba")
     assert outcome.code == 2
     assert "pip install 'freegeo[colmap]'" in outcome.sentence()
+
+
+def test_python_refuses_photos_of_another_reconstruction(result, tmp_path):
+    from freegeo import refine
+    from freegeo.errors import UserError
+
+    found = Reconstruction.load(result / "out")
+    fewer = sorted((result / "photos").iterdir())[:-1]
+    with pytest.raises(UserError, match="the 7 photos are not those of the reconstruction, which has 8 views"):
+        refine(found, fewer)
