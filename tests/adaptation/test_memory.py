@@ -129,8 +129,7 @@ def images(count: int, side: int) -> SceneImages:
     return SceneImages(name="s", count=count, load=lambda frames: pixels[list(frames)])
 
 
-@pytest.mark.parametrize("place", ["device", "disk"])
-@pytest.mark.parametrize("checkpointing", [False, True])
+@pytest.mark.parametrize(("place", "checkpointing"), [("device", False), ("disk", True)])
 @pytest.mark.parametrize("hold", [0.0, 1.0])
 def test_the_peak_is_that_of_the_tensors_alive(place, checkpointing, hold, tmp_path):
     model = wide_da3()
