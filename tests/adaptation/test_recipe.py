@@ -78,7 +78,7 @@ def test_only_our_own_recipe_holds_the_answer_from_all_photos():
 def test_every_recipe_keeps_every_second_view(views):
     """Eight views keep (0, 2, 4, 6), as in the paper; scenes of fewer views and `--views` keep to the same rule."""
     for name in get_args(recipes.RecipeName):
-        dataset = None if name == "scene" else "eth3d"
+        dataset = None if name in recipes.OWN else "eth3d"
         recipe = recipes.named(name, GIANT, dataset).changed(views=max(views, 8), repeat_views=False)
         first = view_sets([views], recipe)[0]
         assert (first.frames, first.kept) == (tuple(range(views)), tuple(range(0, views, 2)))
