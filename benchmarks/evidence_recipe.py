@@ -98,8 +98,11 @@ def report(folder: Path) -> None:
     rooms = [files.read_json(file) for file in sorted(folder.glob("*.json"))]
     domains = sorted({room["domain"] for room in rooms})
     groups = {domain: [room for room in rooms if room["domain"] == domain] for domain in domains}
-    for domain, group in {**groups, "all": rooms}.items():
-        print(f"\n{domain}: {len(group)} rooms, {sum(room['refused'] is None for room in group)} with cameras to learn")
+    taught = [room for room in rooms if room["refused"] is None]
+    for domain, group in {**groups, "all": rooms, "all with cameras to learn": taught}.items():
+        with_cameras = sum(room["refused"] is None for room in group)
+        refined = [sum(name == "seen-12" for name, _ in room["bundle_refused"]) == 0 for room in group]
+        print(f"\n{domain}: {len(group)} rooms, {with_cameras} with cameras to learn, {sum(refined)} refined as a whole")
         for name in SCORED:
             for metric in ("auc15", "auc30", "f1_rel5"):
                 print(

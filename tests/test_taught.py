@@ -58,7 +58,7 @@ def test_a_pair_teaches_or_judges_and_keeps_its_matches():
 
 def test_what_photos_teach_is_nearer_to_the_truth_than_the_prediction(room):
     frozen = predicted(room)
-    found = lesson("room", room.photos, frozen, seed=43)
+    found = lesson("room", room.photos, frozen, seed=44)
     known = found.targets.known
     errors = [
         pair_errors(T[known].double(), room.T_cam_world[known].double()).worst_deg.median()
@@ -67,9 +67,9 @@ def test_what_photos_teach_is_nearer_to_the_truth_than_the_prediction(room):
     assert errors[0] < 0.2 * errors[1]
     nearest, farthest = room.depth_z.quantile(torch.tensor([0.05, 0.95]))
     assert nearest < found.targets.distance < farthest
-    again = lesson("room", room.photos, frozen, seed=43)
+    again = lesson("room", room.photos, frozen, seed=44)
     assert again.targets.digest() == found.targets.digest()
-    assert lesson("room", room.photos, frozen, seed=44).targets.digest() != found.targets.digest()
+    assert lesson("room", room.photos, frozen, seed=45).targets.digest() != found.targets.digest()
 
 
 def test_photos_that_prove_nothing_end_in_a_sentence(monkeypatch):
