@@ -102,7 +102,9 @@ def report(folder: Path) -> None:
     for domain, group in {**groups, "all": rooms, "all with cameras to learn": taught}.items():
         with_cameras = sum(room["refused"] is None for room in group)
         refined = [sum(name == "seen-12" for name, _ in room["bundle_refused"]) == 0 for room in group]
-        print(f"\n{domain}: {len(group)} rooms, {with_cameras} with cameras to learn, {sum(refined)} refined as a whole")
+        print(
+            f"\n{domain}: {len(group)} rooms, {with_cameras} with cameras to learn, {sum(refined)} refined as a whole"
+        )
         for name in SCORED:
             for metric in ("auc15", "auc30", "f1_rel5"):
                 print(

@@ -199,7 +199,7 @@ def test_impossible_settings_are_refused(changes, words):
 
 
 def test_unknown_recipes_and_missing_datasets_are_refused():
-    with pytest.raises(UserError, match="Known are scene, paper, released-da3 and released-vggt"):
+    with pytest.raises(UserError, match="Known are scene, evidence, paper, released-da3 and released-vggt"):
         recipes.named("best", SPEC)
     for name in ("paper", "released-da3", "released-vggt"):
         with pytest.raises(UserError, match="choose --dataset from eth3d, 7scenes, scannetpp, hiroom"):

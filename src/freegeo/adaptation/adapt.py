@@ -383,7 +383,9 @@ def _gain(run: _Run, adapter: Adapter, samples: Samples) -> dict[str, float]:
     for visit in run.steps[-1]:
         sample = samples.take(visit)
         with adapter.off():
-            frozen += sum(float(loss) for loss, _ in _losses(run, adapter, visit, sample))
+            frozen += float(_student_loss(run, adapter, visit, sample)[0])
+            if run.recipe.cameras:  # else there is `hold` only, which is 0 for the frozen model
+                frozen += float(_all_views_loss(run, adapter, sample)[0])
         adapted += sum(float(loss) for loss, _ in _losses(run, adapter, visit, sample))
     count = len(run.steps[-1])
     return {"frozen": frozen / count, "adapted": adapted / count}
