@@ -11,10 +11,11 @@ ANYWHERE = {"types", "errors", "files", "run_folder", "__init__"}
 ALLOWED = {
     "pipeline": {
         *("models", "data", "adaptation", "evidence", "fusion", "export", "report", "metrics", "geometry", "progress"),
-        *("guarded", "refined"),
+        *("guarded", "refined", "taught"),
     },
     "guarded": {"adaptation", "evidence", "export"},
     "refined": {"data", "evidence", "export", "fusion", "guarded", "models"},
+    "taught": {"adaptation", "evidence", "export", "geometry", "guarded"},
     "progress": {"adaptation"},
     "benchmark": {"adaptation", "models", "data", "fusion", "metrics", "geometry"},
     "training": {"models", "data", "metrics", "geometry"},

@@ -15,3 +15,7 @@ class PartialResultError(FreeGeoError):
 
 class DivergedError(FreeGeoError):
     """An adaptation whose loss or gradient is not finite, or has grown beyond recovery: it has no result."""
+
+
+class NoEvidenceError(FreeGeoError):
+    """A scene whose matches between photos prove no cameras, where these are to be learned from."""

@@ -82,6 +82,8 @@ class Evidence:
     """Prediction of all photos by the frozen model."""
     store: Path | None = None
     """File for the matches; None: they are not stored."""
+    matches: Matches | None = None
+    """What judges; None: matches of the photos, made or read here."""
 
 
 def judge_adapter(
@@ -119,7 +121,8 @@ def judge_adapter(
 
     references = [
         Reference.of(
-            Candidate.of(scene.frozen, device), scene_matches(scene.photos, scene.frozen, scene.store, device=device)
+            Candidate.of(scene.frozen, device),
+            scene.matches or scene_matches(scene.photos, scene.frozen, scene.store, device=device),
         )
         for scene in scenes
     ]

@@ -7,7 +7,7 @@ import platform
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,8 +27,10 @@ from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Guard, Recipe
 from freegeo.adaptation.samples import SceneImages
 from freegeo.adaptation.state import remove_state
 from freegeo.data.photos import MAX_VIEWS, load_photos
-from freegeo.errors import DivergedError, FreeGeoError, UserError
+from freegeo.errors import DivergedError, FreeGeoError, NoEvidenceError, UserError
+from freegeo.evidence.bundle import pycolmap_module
 from freegeo.evidence.guard import SHARES
+from freegeo.evidence.matches import Matches
 from freegeo.export.base import DEFAULT_FORMATS, TRACKS_NAME
 from freegeo.export.formats import export, filter_reconstruction
 from freegeo.export.kept import save_kept
@@ -51,6 +53,7 @@ from freegeo.progress import step_bar
 from freegeo.refined import refine_by_photos
 from freegeo.report.page import write_report
 from freegeo.run_folder import Part, RunFolder
+from freegeo.taught import lesson
 from freegeo.types import ImageBatch, PhotoLike
 
 if TYPE_CHECKING:
@@ -229,7 +232,8 @@ def adapt(
     Args:
         model: from `freegeo.load_model`, without an adapter; it is moved to the device.
         photos: at least 3; what `freegeo.load_photos` takes or returned.
-        recipe: `scene`, `paper`, `released-da3`, `released-vggt`, or a recipe of your own.
+        recipe: `scene`, `evidence`, `paper`, `released-da3`, `released-vggt`, or a recipe of your own. `evidence`
+            learns from cameras that matches between the photos prove, and needs the extra `colmap`.
         dataset: with the last three of these names, the dataset whose published settings are used.
         steps: optimiser steps.
         epochs: passes over all view sets, instead of steps.
@@ -255,6 +259,7 @@ def adapt(
     Raises:
         UserError: an argument that cannot be used, fewer than 3 photos, or a run that does not fit into memory.
         FreeGeoError: a loss or gradient that is not finite.
+        NoEvidenceError: recipe `evidence`, and the matches between the photos prove no cameras.
     """
     _require_model(model)
     _warn_of_embedded_model(model)
@@ -263,23 +268,67 @@ def adapt(
         steps=steps, epochs=epochs, lr=lr, rank=rank, hold=hold, views=views,
         keep=None if keep is None else tuple(keep), sets_per_scene=sets, loss=loss,
     )  # fmt: skip
+    if plan.cameras:
+        pycolmap_module()
     found = load_photos(photos, max_views)
     require_enough_photos(found)
     batch = read_photos(model, found, mixed=mixed)
-    scene = scene_images("photos", found, model, plan, batch)
+    images = [scene_images("photos", found, model, plan, batch)]
+    frozen = judging = None
+    if plan.cameras:
+        images, frozen, judging = with_targets(model, images, [(found, batch)], seed=seed, compute=compute)
     folder = None if resume_in is None else Path(resume_in).expanduser()
     with step_bar(on_step) if progress else nullcontext(on_step) as follow:
         result = train_adapter(
-            model, [scene], plan, seed=seed, compute=compute, resume_in=folder, on_step=follow,
+            model, images, plan, seed=seed, compute=compute, resume_in=folder, on_step=follow,
             keep_after=() if guard == "off" else SHARES,
         )  # fmt: skip
     if result.trouble:
         logger.warning("%s", _capital(result.trouble))
         return result
-    judge_by_photos(model, result, [(found, batch)], compute=compute, guard=guard)
+    judge_by_photos(model, result, [(found, batch)], compute=compute, guard=guard, frozen=frozen, judging=judging)
     if result.trouble:
         logger.warning("%s", _capital(result.trouble))
     return result
+
+
+def with_targets(
+    model: ReconstructionModel,
+    images: Sequence[SceneImages],
+    scenes: Sequence[tuple[Sequence[PhotoLike], ImageBatch]],
+    *,
+    seed: int,
+    compute: Compute,
+    reference: str | None = None,
+    frozen: Sequence[Reconstruction] | None = None,
+    stores: Sequence[Path | None] | None = None,
+) -> tuple[list[SceneImages], list[Reconstruction], list[Matches]]:
+    """Give scenes the cameras that their photos prove, for a recipe that learns from them.
+
+    Args:
+        model: without an adapter.
+        images: of the scenes.
+        scenes: their photos, and the same as images for the model.
+        seed: decides which pairs of photos teach.
+        compute: where predictions are made.
+        reference: rule of the reference view.
+        frozen: predictions; None: they are made here.
+        stores: files for the matches of the scenes; None: they are not stored.
+
+    Returns:
+        The scenes with targets, the frozen predictions, and the matches that are left to judge by.
+
+    Raises:
+        NoEvidenceError: the matches of a scene prove no cameras.
+    """
+    if frozen is None:
+        frozen = [predict(model, batch, reference=reference, compute=compute) for _, batch in scenes]
+    lessons = [
+        lesson(one.name, photos, before, store, seed=seed, device=str(compute.device))
+        for one, (photos, _), before, store in zip(images, scenes, frozen, stores or [None] * len(scenes), strict=True)
+    ]
+    taught = [replace(one, targets=found.targets) for one, found in zip(images, lessons, strict=True)]
+    return taught, list(frozen), [found.judging for found in lessons]
 
 
 def judge_by_photos(
@@ -292,6 +341,7 @@ def judge_by_photos(
     reference: str | None = None,
     frozen: Sequence[Reconstruction] | None = None,
     stores: Sequence[Path | None] | None = None,
+    judging: Sequence[Matches] | None = None,
 ) -> None:
     """Judge a finished adapter by the photos of its scenes, and keep the verdict in the result.
 
@@ -306,6 +356,7 @@ def judge_by_photos(
         reference: rule of the reference view.
         frozen: predictions without the adapter; None: they are made here.
         stores: files for the matches of the scenes; None: they are not stored.
+        judging: the matches that judge, where others taught; None: all matches of the photos.
     """
 
     def predicted(batch: ImageBatch) -> Reconstruction | None:
@@ -332,8 +383,10 @@ def judge_by_photos(
     if not asked:
         return
     evidence = [
-        Evidence(photos=photos, batch=batch, frozen=before, store=store)
-        for (photos, batch), before, store in zip(scenes, frozen, stores or [None] * len(scenes), strict=True)
+        Evidence(photos=photos, batch=batch, frozen=before, store=store, matches=matches)
+        for (photos, batch), before, store, matches in zip(
+            scenes, frozen, stores or [None] * len(scenes), judging or [None] * len(scenes), strict=True
+        )
     ]
     verdict = judge_adapter(result, evidence, predicted, device=str(compute.device), select=guard == "select")
     logger.info("%s", verdict.reason)
@@ -491,19 +544,27 @@ class Job:
         """
         folder = self.folder / ADAPTER_FOLDER
         noted = self._noted("adaptation")
-        if "diverged" in noted:
-            return noted["diverged"], None
+        if "failed" in noted:
+            return noted["failed"], None
         if not (folder / METADATA).is_file():
             assert self.scene is not None
-            self.hooks.stage("adaptation")
+            images, judging, stores = [self.scene(self.model)], None, [self.folder / MATCHES_NAME]
             try:
+                if recipe.cameras:
+                    assert self.photos is not None
+                    self.hooks.stage("cameras to learn from")
+                    images, _, judging = with_targets(
+                        self.model, images, [(self.photos, self.batch)], seed=self.seed, compute=self.compute,
+                        frozen=[frozen], stores=stores,
+                    )  # fmt: skip
+                self.hooks.stage("adaptation")
                 result = train_adapter(
-                    self.model, [self.scene(self.model)], recipe, seed=self.seed, compute=self.compute,
+                    self.model, images, recipe, seed=self.seed, compute=self.compute,
                     resume_in=folder, on_step=self.hooks.step, keep_after=() if self.guard == "off" else SHARES,
                 )  # fmt: skip
-            except DivergedError as error:
+            except (DivergedError, NoEvidenceError) as error:
                 remove_state(folder)
-                self.folder.note("adaptation", {**noted, "diverged": str(error)})
+                self.folder.note("adaptation", {**noted, "failed": str(error)})
                 return str(error), None
             self.in_place = result.adapter
             seconds = {"adaptation": round(result.seconds, 2)}
@@ -514,7 +575,7 @@ class Job:
                 started = time.monotonic()
                 judge_by_photos(
                     self.model, result, [(self.photos, self.batch)], compute=self.compute, guard=self.guard,
-                    reference=self.reference, frozen=[frozen], stores=[self.folder / MATCHES_NAME],
+                    reference=self.reference, frozen=[frozen], stores=stores, judging=judging,
                 )  # fmt: skip
                 seconds["evidence"] = round(time.monotonic() - started, 2)
             result.save(folder)

@@ -78,7 +78,7 @@ def test_only_our_own_recipe_holds_the_answer_from_all_photos():
 def test_every_recipe_keeps_every_second_view(views):
     """Eight views keep (0, 2, 4, 6), as in the paper; scenes of fewer views and `--views` keep to the same rule."""
     for name in get_args(recipes.RecipeName):
-        dataset = None if name == "scene" else "eth3d"
+        dataset = None if name in recipes.OWN else "eth3d"
         recipe = recipes.named(name, GIANT, dataset).changed(views=max(views, 8), repeat_views=False)
         first = view_sets([views], recipe)[0]
         assert (first.frames, first.kept) == (tuple(range(views)), tuple(range(0, views, 2)))
@@ -199,7 +199,7 @@ def test_impossible_settings_are_refused(changes, words):
 
 
 def test_unknown_recipes_and_missing_datasets_are_refused():
-    with pytest.raises(UserError, match="Known are scene, paper, released-da3 and released-vggt"):
+    with pytest.raises(UserError, match="Known are scene, evidence, paper, released-da3 and released-vggt"):
         recipes.named("best", SPEC)
     for name in ("paper", "released-da3", "released-vggt"):
         with pytest.raises(UserError, match="choose --dataset from eth3d, 7scenes, scannetpp, hiroom"):

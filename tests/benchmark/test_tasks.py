@@ -247,3 +247,8 @@ def test_an_adaptation_that_diverges_is_a_problem_of_its_tasks(setup):
 def test_recipe_scene_is_the_same_for_every_dataset(setup):
     recipe = Predictor(replace(setup, recipe="scene")).recipe(DATASET)
     assert (recipe.name, recipe.steps) == ("scene", 2)
+
+
+def test_recipe_evidence_is_refused_as_the_benchmark_makes_no_cameras_to_learn(setup):
+    with pytest.raises(UserError, match="does not make the cameras that recipe 'evidence' learns from"):
+        Predictor(replace(setup, recipe="evidence")).recipe(DATASET)

@@ -449,3 +449,35 @@ def test_two_processes_do_not_write_into_one_folder(freegeo, photo_folder, tiny,
         outcome = freegeo("run", photo_folder, "-o", tmp_path, *tiny, *QUICK)
     assert outcome.code == 2
     assert "another freegeo process" in outcome.sentence()
+
+
+@pytest.mark.parametrize("command", ["run", "adapt"])
+def test_photos_that_prove_no_cameras_are_not_learned_from(freegeo, photo_folder, tiny, tmp_path, command):
+    pytest.importorskip("pycolmap", reason="needs the extra colmap")
+    out = tmp_path / "out"
+    options = [*tiny, *QUICK, "--recipe", "evidence"]
+    outcome = freegeo(command, photo_folder, "-o", out, *options)
+    words = "the matches between the photos of"
+    if command == "adapt":
+        assert outcome.code == 1
+        assert f"not adapted: {words} {photo_folder} prove no cameras to learn from." in outcome.sentence()
+        assert not (out / "adapter_model.safetensors").exists()
+        return
+    assert outcome.code == 0, outcome.err
+    summary = json.loads((out / "reconstruction.json").read_text())
+    (warning,) = [sentence for sentence in summary["warnings"] if sentence.startswith(f"Not adapted: {words} photos")]
+    assert warning.endswith("The result is that of the frozen model.")
+    assert summary["adapter"] is None
+    assert (out / "prediction.npz").read_bytes() == (out / "frozen" / "prediction.npz").read_bytes()
+    assert "already finished" in freegeo("run", photo_folder, "-o", out, *options).out
+
+
+@pytest.mark.parametrize("command", ["run", "adapt"])
+def test_the_extra_of_recipe_evidence_is_asked_for_before_anything_is_written(
+    freegeo, photo_folder, tiny, tmp_path, monkeypatch, command
+):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    outcome = freegeo(command, photo_folder, "-o", tmp_path / "out", *tiny, "--recipe", "evidence")
+    assert outcome.code == 2
+    assert "pip install 'freegeo[colmap]'" in outcome.sentence()
+    assert not (tmp_path / "out").exists()

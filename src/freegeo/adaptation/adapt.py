@@ -22,15 +22,16 @@ from torch import Tensor
 
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.adapter_files import save_adapter
-from freegeo.adaptation.losses import adaptation_loss, feature_distance, not_finite
+from freegeo.adaptation.losses import CameraTargets, adaptation_loss, camera_loss, feature_distance, not_finite
 from freegeo.adaptation.memory import Plan, plan_adaptation
 from freegeo.adaptation.recipe import Recipe, require_seed
 from freegeo.adaptation.samples import Sample, Samples, SceneImages, loss_features, step_draws, step_seed
 from freegeo.adaptation.state import read_state, remove_state, undisturbed, write_state
 from freegeo.adaptation.views import Visit, schedule, substitution
-from freegeo.errors import DivergedError, FreeGeoError
+from freegeo.errors import DivergedError, FreeGeoError, UserError
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
+from freegeo.types import Features
 
 logger = logging.getLogger(__name__)
 
@@ -202,6 +203,7 @@ def adapt(
         FreeGeoError: memory that runs out even with the smallest plan.
     """
     require_seed(seed)
+    require_targets(scenes, recipe)
     compute = compute.preferring(recipe.precision)
     if said := substitution([scene.count for scene in scenes], recipe):
         logger.info(said)
@@ -226,6 +228,16 @@ def adapt(
         model, scenes, recipe, seed=seed, compute=compute, plan=smallest, resume_in=resume_in, on_step=on_step,
         on_epoch=on_epoch, keep_after=keep_after,
     )  # fmt: skip
+
+
+def require_targets(scenes: Sequence[SceneImages], recipe: Recipe) -> None:
+    """Raise UserError when the recipe learns from cameras and a scene has none."""
+    without = [scene.name for scene in scenes if scene.targets is None]
+    if recipe.cameras and without:
+        raise UserError(
+            f"recipe '{recipe.name}' learns from cameras that matches between photos prove, and {without[0]} has none. "
+            "It works with `freegeo run`, `freegeo adapt` and freegeo.adapt; choose another --recipe here."
+        )
 
 
 @dataclass(frozen=True)
@@ -303,33 +315,62 @@ def _learn(
 ) -> dict[str, Tensor]:
     """Add the gradients of one view set, and return its share of the step's loss terms."""
     share = 1 / len(run.steps[visit.step])
-    loss, terms = _student_loss(run, adapter, visit, sample)
-    scaler.scale(loss * share).backward()
-    if run.recipe.hold:
-        held = _hold_loss(run, adapter, sample)
-        scaler.scale(held * share).backward()
-        terms = {**terms, "hold": held.detach(), "total": terms["total"] + held.detach()}
-    return {name: term * share for name, term in terms.items()}
+    total, terms = torch.zeros((), device=run.compute.device), {}
+    for loss, parts in _losses(run, adapter, visit, sample):
+        scaler.scale(loss * share).backward()
+        total = total + loss.detach()
+        terms |= parts
+    return {name: term * share for name, term in {**terms, "total": total}.items()}
+
+
+def _losses(run: _Run, adapter: Adapter, visit: Visit, sample: Sample) -> Generator[tuple[Tensor, dict[str, Tensor]]]:
+    """Yield the loss of each forward pass that the recipe needs, with its detached terms; `total` is their sum."""
+    yield _student_loss(run, adapter, visit, sample)
+    if run.recipe.sees_all:
+        yield _all_views_loss(run, adapter, sample)
 
 
 def _student_loss(run: _Run, adapter: Adapter, visit: Visit, sample: Sample) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the adaptation loss of one view set, and its detached terms."""
-    draws = step_draws(sample, visit, run.recipe.loss, seed=run.seed)
+    """Return the losses of the student's views: features against the teacher's, cameras against the targets."""
+    recipe = run.recipe
     tokens, teacher = sample.student()
     with run.compute.autocast():
         student = loss_features(adapter.model, tokens)
-    return adaptation_loss(
-        student.levels, teacher, sample.held_out, draws, run.recipe.loss, form=sample.form,
-        patches=sample.student_patches(),
-    )  # fmt: skip
+    losses, terms = [], {}
+    if recipe.features:
+        draws = step_draws(sample, visit, recipe.loss, seed=run.seed)
+        loss, terms = adaptation_loss(
+            student.levels, teacher, sample.held_out, draws, recipe.loss, form=sample.form,
+            patches=sample.student_patches(),
+        )  # fmt: skip
+        losses.append(recipe.features * loss)
+    if recipe.cameras:
+        losses.append(recipe.cameras * _camera_loss(adapter.model, student, sample.student_targets()))
+        terms["cameras"] = losses[-1].detach()
+    return torch.stack(losses).sum(), terms
 
 
-def _hold_loss(run: _Run, adapter: Adapter, sample: Sample) -> Tensor:
-    """Return the distance of the adapted features from the frozen ones, over all views (not in the paper)."""
+def _all_views_loss(run: _Run, adapter: Adapter, sample: Sample) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the losses of all N views (not in the paper): features held where they were, cameras as above."""
+    recipe = run.recipe
     with run.compute.autocast():
         adapted = loss_features(adapter.model, sample.tokens)
-    levels, teacher = adapted.levels, sample.teacher.levels
-    return run.recipe.hold * feature_distance(levels, teacher, run.recipe.loss, patches=sample.patches)[0]
+    terms = {}
+    if recipe.hold:
+        distance, _ = feature_distance(adapted.levels, sample.teacher.levels, recipe.loss, patches=sample.patches)
+        terms["hold"] = recipe.hold * distance
+    if recipe.cameras:
+        terms["cameras_all"] = recipe.cameras * _camera_loss(adapter.model, adapted, sample.targets)
+    return torch.stack(list(terms.values())).sum(), {name: term.detach() for name, term in terms.items()}
+
+
+def _camera_loss(model: ReconstructionModel, features: Features, targets: CameraTargets | None) -> Tensor:
+    """Return the distance of the cameras that the frozen head reads off the features from the targets."""
+    assert targets is not None
+    found = model.decode(features, want=("cameras",))
+    assert found.T_cam_world is not None
+    assert found.K is not None
+    return camera_loss(found.T_cam_world[0], found.K[0], targets)
 
 
 @torch.no_grad()
@@ -343,9 +384,9 @@ def _gain(run: _Run, adapter: Adapter, samples: Samples) -> dict[str, float]:
         sample = samples.take(visit)
         with adapter.off():
             frozen += float(_student_loss(run, adapter, visit, sample)[0])
-        adapted += float(_student_loss(run, adapter, visit, sample)[0])
-        if run.recipe.hold:  # 0 for the frozen model
-            adapted += float(_hold_loss(run, adapter, sample))
+            if run.recipe.cameras:  # else there is `hold` only, which is 0 for the frozen model
+                frozen += float(_all_views_loss(run, adapter, sample)[0])
+        adapted += sum(float(loss) for loss, _ in _losses(run, adapter, visit, sample))
     count = len(run.steps[-1])
     return {"frozen": frozen / count, "adapted": adapted / count}
 
@@ -452,8 +493,14 @@ class _State:
         return about["next_step"]
 
     def _identity(self) -> str:
-        """Return a fingerprint of model name, scenes, recipe, seed and precision; pixels and weights are left out."""
-        scenes = [(scene.name, scene.count) for scene in self.run.scenes]
+        """Return a fingerprint of model name, scenes, recipe, seed and precision; pixels and weights are left out.
+
+        The targets of a scene are in it: they depend on more than the photos.
+        """
+        scenes = [
+            (scene.name, scene.count, None if scene.targets is None else scene.targets.digest())
+            for scene in self.run.scenes
+        ]
         model, recipe = self.run.model.spec.name, asdict(self.run.recipe)
         about = {"model": model, "scenes": scenes, "recipe": recipe, "seed": self.run.seed}
         about["precision"] = self.run.compute.precision

@@ -126,7 +126,7 @@ class Footprint:
         self.largest = max(self.visits, key=lambda view_set: len(view_set.frames) * self.tokens[view_set.scene])
 
     def plan(self, place: Place, checkpointing: bool) -> Plan:
-        """Predict what is on the device at the peak: in the teacher's pass, the student's or that of `hold`."""
+        """Predict what is on the device at the peak: in the teacher's pass, the student's or that of all views."""
         kept = self._kept_peak
         sample = self._sample(self.largest)
         teacher, learning = self._teacher(sample), self._learning(checkpointing)
@@ -147,10 +147,10 @@ class Footprint:
         return passing + shape.token_bytes(2 * tokens) + shape.half_copies(self.compute) + sample
 
     def _learning(self, checkpointing: bool) -> list[tuple[str, int]]:
-        """Return the parts of the larger of the two passes with gradients: the student's, and that of `hold`."""
+        """Return the parts of the larger of the two passes with gradients: the student's, and that of all views."""
         kept = self._count(self.largest.kept)
         options = [self._pass(kept, self._losses(kept), checkpointing)]
-        if self.recipe.hold:
+        if self.recipe.sees_all:
             every = self._count(self.largest.frames)
             options.append(self._pass(every, WIDE * every * self.shape.channels, checkpointing))
             # The student's own tokens and targets are copies of a part of the sample.
@@ -209,7 +209,7 @@ class Footprint:
     def _sample(self, view_set: ViewSet) -> int:
         """Bytes of the sample of a view set (a model that adds its special tokens later has a few tokens less)."""
         per_view, held_out = self.tokens[view_set.scene], len(view_set.frames) - len(view_set.kept)
-        read = len(view_set.frames if self.recipe.hold else view_set.kept)
+        read = len(view_set.frames if self.recipe.sees_all else view_set.kept)
         anchors = held_out * (per_view - (0 if self.recipe.loss.cross_tokens == "all" else self.shape.special))
         features = WIDE * self.shape.channels * (self.layers * read * per_view + anchors)
         return self.shape.token_bytes(read * per_view) + features

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-RecipeName = Literal["scene", "paper", "released-da3", "released-vggt"]
+RecipeName = Literal["scene", "evidence", "paper", "released-da3", "released-vggt"]
 DatasetName = Literal["eth3d", "7scenes", "scannetpp", "hiroom", "procedural"]
 Guard = Literal["select", "report", "off"]
 """What the matches between the photos decide about an adapter (docs/guard.md)."""
@@ -161,6 +161,11 @@ class Recipe:
     """Whether the views of a set are consecutive frames, for models trained on such views only; else random ones."""
     hold: float
     """Weight of the distance between adapted and frozen features of all N views; 0: no such term, as in the paper."""
+    features: float
+    """Weight of the losses between the features of student and teacher; 0 in `evidence`, 1 in all others."""
+    cameras: float
+    """Weight of the distance of the decoded cameras, of the student's and of all N views, from those of the scene's
+    `targets`; 0: no such term, as in the paper."""
     augmentation: Literal["none", "released"]
     """`released`: mirror the set with p = .5, brighten each view with p = .5 by U(.8, 1.2), fixed by the set's seed."""
     squash: int | None
@@ -188,6 +193,13 @@ class Recipe:
             self._check_keep(self.keep)
         if not 0 <= self.hold < math.inf:
             raise UserError(f"--hold must be 0 or more and finite, got {self.hold}.")
+        for name in ("features", "cameras"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise UserError(f"recipe setting {name} must be 0 or more and finite, got {getattr(self, name)}.")
+        if not (self.features or self.cameras):
+            raise UserError("a recipe needs a weight of features or of cameras above 0.")
+        if self.cameras and (self.squash is not None or self.augmentation != "none"):
+            raise UserError("recipe setting cameras needs images as the model makes them: no squash, no augmentation.")
         for name in ("lr", "rank", "alpha", "batch", "sets_per_scene", "distinct_seeds", "clip"):
             if not 0 < getattr(self, name) < math.inf:
                 option = _OPTIONS.get(name, f"recipe setting {name}")
@@ -201,6 +213,11 @@ class Recipe:
                 raise UserError(f"recipe setting {name} must be from 0 to below {end}, got {getattr(self, name)}.")
         if (self.steps is None) == (self.epochs is None) or (self.steps or self.epochs or 0) < 1:
             raise UserError("a recipe needs either --steps or --epochs, not both, and at least 1.")
+
+    @property
+    def sees_all(self) -> bool:
+        """Whether a term compares what the adapted model says with all N views."""
+        return bool(self.hold or self.cameras)
 
     def _check_keep(self, keep: tuple[int, ...]) -> None:
         listed = ",".join(map(str, keep))
@@ -326,6 +343,8 @@ PAPER = Recipe(
     repeat_views=False,
     neighbours=False,
     hold=0.0,
+    features=1.0,
+    cameras=0.0,
     augmentation="none",
     squash=None,
     warmup=0.15,
@@ -360,13 +379,13 @@ def named(name: str, spec: ModelSpec, dataset: str | None = None) -> Recipe:
 
     UserError for an unknown recipe or dataset, a dataset recipe without a dataset, or `scene` with one.
     """
-    if name == "scene":
+    if name in OWN:
         if dataset is not None:
             raise UserError(
-                f"recipe 'scene' has no settings per dataset, so --dataset {dataset} would change nothing. Leave it "
+                f"recipe '{name}' has no settings per dataset, so --dataset {dataset} would change nothing. Leave it "
                 "out, or choose --recipe paper, released-da3 or released-vggt."
             )
-        return scene(spec)
+        return OWN[name](spec)
     if name == "paper":
         return paper(spec, dataset)
     families = {RELEASED_DA3.name: "da3", RELEASED_VGGT.name: "vggt"}
@@ -390,6 +409,15 @@ def scene(spec: ModelSpec) -> Recipe:
         loss={"temperature": own.temperature},
     )  # fmt: skip
     return replace(found, precision=None)
+
+
+def evidence(spec: ModelSpec) -> Recipe:
+    """Return the recipe that learns cameras which matches between the photos prove, instead of features."""
+    return replace(scene(spec), name="evidence", cameras=1.0, features=0.0)
+
+
+OWN: Mapping[str, Callable[[ModelSpec], Recipe]] = {"scene": scene, "evidence": evidence}
+"""Our recipes for the photos of one place, which have no settings per dataset."""
 
 
 def paper(spec: ModelSpec, dataset: str | None) -> Recipe:

@@ -24,6 +24,7 @@ from torch.nn import functional as F
 
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.losses import (
+    CameraTargets,
     KLForm,
     Level,
     StepDraws,
@@ -65,6 +66,8 @@ class SceneImages:
     load: Callable[[Sequence[int]], Tensor]
     inside: Tensor | None = None
     """(count, H, W) bool: false where an image is padding; None: no image has any."""
+    targets: CameraTargets | None = None
+    """Cameras of the images to learn from; needed by a recipe with the weight `cameras`."""
 
     @classmethod
     def from_batch(cls, name: str, batch: ImageBatch) -> SceneImages:
@@ -135,7 +138,7 @@ class Sample:
     """Everything a visit reads of its view set; tensors have a batch of 1 and no gradient."""
 
     tokens: ViewTokens
-    """The embedded views: the kept ones, or all N where the recipe has the `hold` term."""
+    """The embedded views: the kept ones, or all N where the recipe has a term of all views."""
     teacher: Features
     """The teacher's features of the same views at the loss layers."""
     held_out: Tensor
@@ -146,6 +149,8 @@ class Sample:
     """How the all-pairs KL is computed; None: the loss measures it, which makes an accelerator wait."""
     patches: Tensor | None = None
     """(views of `tokens`, P) bool, on the CPU: patches that take part in the losses; None: all."""
+    targets: CameraTargets | None = None
+    """Cameras of the views of `tokens`; None where the recipe has no camera term."""
 
     def student(self) -> tuple[ViewTokens, Mapping[int, Level]]:
         """Return tokens and teacher features of the student's views."""
@@ -156,6 +161,10 @@ class Sample:
     def student_patches(self) -> Tensor | None:
         """Return the patches (M, P) of the student's views that take part in the losses; None: all."""
         return None if self.patches is None else self.patches[list(self.kept)]
+
+    def student_targets(self) -> CameraTargets | None:
+        """Return the cameras of the student's views."""
+        return None if self.targets is None else self.targets.select(self.kept)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors by name."""
@@ -179,8 +188,9 @@ class Sample:
     def to(self, device: torch.device) -> Sample:
         """Return the sample on a device."""
         return replace(
-            self, tokens=self.tokens.to(device), teacher=self.teacher.to(device), held_out=self.held_out.to(device)
-        )
+            self, tokens=self.tokens.to(device), teacher=self.teacher.to(device), held_out=self.held_out.to(device),
+            targets=None if self.targets is None else self.targets.to(device),
+        )  # fmt: skip
 
 
 class Samples:
@@ -235,7 +245,8 @@ class Samples:
         tokens = next(self._tokens)
         with self._adapter.off(), self._compute.autocast():
             features = loss_features(model, tokens)
-        read = view_set.positions if self._recipe.hold else view_set.kept
+        read = view_set.positions if self._recipe.sees_all else view_set.kept
+        targets = self._scenes[view_set.scene].targets if self._recipe.cameras else None
         patches = seen_patches(self._scenes[view_set.scene], view_set, tokens.grid_hw, self._recipe)
         sample = Sample(
             tokens=tokens.select(read),
@@ -243,8 +254,10 @@ class Samples:
             held_out=held_out_tokens(features.levels[max(features.levels)], view_set.kept, config, patches=patches),
             kept=tuple(read.index(position) for position in view_set.kept),
             patches=None if patches is None else patches[list(read)],
+            targets=None if targets is None else targets.select([view_set.frames[position] for position in read]),
         )
-        if self._compute.device.type == "cpu" or not config.uses_distances or config.pairing != "all":
+        measured = self._recipe.features and config.uses_distances and config.pairing == "all"
+        if self._compute.device.type == "cpu" or not measured:
             return sample
         # Read once per view set instead of in every step, where an accelerator would have to wait for it.
         levels, draws = sample.student()[1], step_draws(sample, visit, config, seed=self._seed)

@@ -124,7 +124,12 @@ class Predictor:
         """
         row = get_dataset(dataset).recipe_row or DEFAULT_ROW
         name = self.setup.recipe
-        return recipes.named(name, self.model.spec, None if name == "scene" else row).changed(**self.setup.changes)
+        recipe = recipes.named(name, self.model.spec, None if name in recipes.OWN else row)
+        if recipe.cameras:
+            raise UserError(
+                f"the benchmark does not make the cameras that recipe '{name}' learns from. Choose another --recipe."
+            )
+        return recipe.changed(**self.setup.changes)
 
     def unfinished(self, tasks: Sequence[Task]) -> list[Task]:
         """The tasks that still have to be predicted; UserError when one was made with other settings."""

@@ -96,20 +96,24 @@ def _train(
     from freegeo.adaptation.adapter_files import export_published, save_adapter
     from freegeo.errors import FreeGeoError
     from freegeo.evidence.guard import SHARES
-    from freegeo.pipeline import judge_by_photos
+    from freegeo.pipeline import judge_by_photos, with_targets
 
     def keep_epoch(epoch: int, adapter) -> None:
         if plan.epochs is not None:
             about = {"epoch": epoch, "scenes": [scene.name for scene in images], "seed": model.seed}
             save_adapter(adapter, folder / "epochs" / f"epoch_{epoch}", about)
 
+    compute, frozen, judging = model.compute(), None, None
+    if plan.cameras:
+        console.note("cameras to learn from ...")
+        images, frozen, judging = with_targets(loaded, images, scenes, seed=model.seed, compute=compute)
     with step_bar() as on_step:
         result = train_adapter(
-            loaded, images, plan, seed=model.seed, compute=model.compute(), resume_in=folder, on_step=on_step,
+            loaded, images, plan, seed=model.seed, compute=compute, resume_in=folder, on_step=on_step,
             on_epoch=keep_epoch, keep_after=() if guard == "off" else SHARES,
         )  # fmt: skip
     if result.trouble is None:
-        judge_by_photos(loaded, result, scenes, compute=model.compute(), guard=guard)
+        judge_by_photos(loaded, result, scenes, compute=compute, guard=guard, frozen=frozen, judging=judging)
     result.save(folder)
     if result.trouble:
         raise FreeGeoError(f"{folder}: {result.trouble} The adapter is there to be looked at; do not use it.")

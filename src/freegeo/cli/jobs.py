@@ -33,7 +33,10 @@ LABELS = {
     "checkpoint": "other weights", "weights": "another adapter", "folder": "--adapter", "masks": "other masks",
     "command": "the command", "recipe": "--adapt", "name": "--recipe", "sets_per_scene": "--sets",
     "adapting_precision": "--precision", "refinement": "--refine",
-    **dict.fromkeys(("alpha", "first_seed", "distinct_seeds", "final_lr", "batch"), "what follows from the recipe"),
+    **dict.fromkeys(
+        ("alpha", "first_seed", "distinct_seeds", "final_lr", "batch", "features", "cameras"),
+        "what follows from the recipe",
+    ),
     **{
         name: f"--{name}"
         for name in (

@@ -167,9 +167,10 @@ class RecipeOptions:
     """How the model is adapted; options left out come from the recipe."""
 
     recipe: RecipeName = "scene"
-    """Named settings: scene for your own photos, the others as published, which also need --dataset."""
+    """Named settings: scene for your own photos; evidence, which also learns cameras from matches between them (needs
+    the extra colmap); the others as published, which also need --dataset."""
     dataset: DatasetName | None = None
-    """Dataset whose published settings are used, with every recipe but scene."""
+    """Dataset whose published settings are used, with every recipe but scene and evidence."""
     views: int | None = None
     """Photos in one training example; the model learns to see from some of them what it sees from all. Default: 8."""
     keep: str | None = None
@@ -185,13 +186,16 @@ class RecipeOptions:
     rank: int | None = None
     """Size of the adapter: rank of its matrices. Default: 32 (freegeo-tiny: 16)."""
     hold: float | None = None
-    """How strongly the answer from all photos is held where it was. Default: 1 with recipe scene, else 0."""
+    """How strongly the answer from all photos is held where it was. Default: 1 with scene and evidence, else 0."""
     loss: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     """Settings of the loss, such as weight_kq=0 or selection=topk,angle_weights=2,2,2; may be given several times."""
 
     def build(self, spec: ModelSpec) -> Recipe:
-        """Return the recipe for a model."""
-        return named(self.recipe, spec, self.dataset).changed(**self.changes())
+        """Return the recipe for a model; UserError when something that it needs is not installed."""
+        recipe = named(self.recipe, spec, self.dataset).changed(**self.changes())
+        if recipe.cameras:
+            require_refinement("ba")
+        return recipe
 
     def changes(self) -> dict[str, Any]:
         """Return what `Recipe.changed` takes: every setting of the recipe, None where the option was left out."""

@@ -17,7 +17,7 @@ import logging
 import zipfile
 import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -147,6 +147,17 @@ class Matches:
         """Photo pixels (n, 2) of a pair's matches in its first and in its second view."""
         first, second = self.ends[self.pair_start[pair] : self.pair_start[pair + 1]].T
         return self.keypoints[first], self.keypoints[second]
+
+    def only(self, pairs: np.ndarray) -> Matches:
+        """Return the matches of some pairs (indices, ascending); photos and keypoints stay."""
+        rows = [np.arange(self.pair_start[pair], self.pair_start[pair + 1]) for pair in pairs]
+        return replace(
+            self,
+            pairs=self.pairs[pairs],
+            pair_start=np.concatenate(([0], np.cumsum([len(row) for row in rows]))).astype(np.int64),
+            ends=self.ends[np.concatenate([*rows, np.zeros(0, np.int64)]).astype(np.int64)],
+            flatness=self.flatness[pairs],
+        )
 
     def in_matching_pixels(self) -> np.ndarray:
         """Return the keypoints (N, 2) float64 in pixels of the shrunk photos, centres at whole numbers."""

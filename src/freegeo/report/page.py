@@ -91,6 +91,7 @@ def render(result: Result, pairs: Sequence[PairPicture] = ()) -> str:
         cameras=camera_rows(result),
         loss=Markup(figures.loss_curve(curve)) if curve else None,
         steps=len(curve),
+        taught=bool(curve) and "cameras" in curve[0],
         loss_change=result.summary.get("loss"),
         truth_rows=truth_rows(result),
         scores=score_table(result.scores),

@@ -1,0 +1,149 @@
+"""What recipe `evidence` is worth beside recipe `scene` and bundle adjustment alone, on generated rooms.
+
+    python benchmarks/evidence_recipe.py record -o out/evidence --domains test-id tex --rooms 6 [--start 0] [--seed 44]
+    python benchmarks/evidence_recipe.py report out/evidence
+
+`record` adapts the embedded model to frames 0 to 11 of each room (256 x 192 photos) by both recipes, predicts sets of
+frames (some of which adaptation never saw), refines the frozen predictions of the same sets by bundle adjustment, and
+writes one file a room; rooms that have a file are skipped. `report` prints the table of docs/guard.md: means over rooms
+of the change against the frozen model, with paired 95 % intervals. Where the photos prove no cameras to learn from,
+`evidence` is the frozen model, and where bundle adjustment is refused, so is that. One thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from guard import ADAPTED_TO, SETS
+
+from freegeo import files
+from freegeo.adaptation import recipe as recipes
+from freegeo.adaptation.adapt import adapt
+from freegeo.adaptation.samples import SceneImages
+from freegeo.data.procedural import get_domain, photograph_room
+from freegeo.errors import NoEvidenceError
+from freegeo.evidence.matches import find_matches
+from freegeo.evidence.refinement import bring_depth, refine
+from freegeo.metrics.bootstrap import paired_interval
+from freegeo.metrics.scene import evaluate
+from freegeo.models.catalog import load_model
+from freegeo.models.precision import Compute
+from freegeo.pipeline import predict
+from freegeo.taught import lesson
+
+SCORED = {**SETS, "half-8": [list(range(8, 16))]}
+METRICS = ("auc15", "auc30", "f1_rel5", "abs_rel")
+WAYS = ("scene", "evidence", "bundle")
+
+
+def record(folder: Path, domain: str, room: int, seed: int) -> None:
+    """Adapt to one room in both ways and write its file."""
+    file = folder / f"{domain}-{room:03d}-seed{seed}.json"
+    if file.is_file():
+        return
+    started = time.process_time()
+    scene = photograph_room(next(iter(get_domain(domain).seeds(1, start=room))), domain, frames=16)
+    model = load_model("freegeo-tiny")
+    batch = model.preprocess(scene.photos)
+    scores, seconds, refused = {"frozen": {}, "bundle": {}}, {}, []
+    for name, sets in SCORED.items():
+        found = [predict(model, batch.select(frames)) for frames in sets]
+        scores["frozen"][name] = scored(found, scene, sets)
+        for k, frames in enumerate(sets):
+            refinement = refine(found[k], find_matches(scene.select(frames).photos))
+            if refinement.accepted:
+                found[k] = bring_depth(found[k], refinement)[0]
+            else:
+                refused.append([name, refinement.reason])
+        scores["bundle"][name] = scored(found, scene, sets)
+    seconds["frozen and bundle"] = time.process_time() - started
+    own = batch.select(ADAPTED_TO)
+    images = SceneImages.from_batch("room", own)
+    told = None
+    for recipe in (recipes.scene(model.spec), recipes.evidence(model.spec)):
+        started = time.process_time()
+        if recipe.cameras:
+            try:
+                found = lesson("the room", scene.select(ADAPTED_TO).photos, predict(model, own), seed=seed)
+            except NoEvidenceError as error:
+                told = str(error)
+                scores[recipe.name] = scores["frozen"]
+                continue
+            images = replace(images, targets=found.targets)
+        made = adapt(model, [images], recipe, seed=seed, compute=Compute())
+        seconds[recipe.name] = time.process_time() - started
+        scores[recipe.name] = {
+            name: scored([predict(model, batch.select(frames)) for frames in sets], scene, sets)
+            for name, sets in SCORED.items()
+        }
+        made.adapter.detach()
+    content = {"domain": domain, "scores": scores, "refused": told, "bundle_refused": refused, "seconds": seconds}
+    files.write_json(file, content)
+    print(file.name, {name: round(value) for name, value in seconds.items()}, told or "taught", flush=True)
+
+
+def scored(found: list, scene, sets: list[list[int]]) -> list[float]:
+    """Mean scores over sets of frames."""
+    rows = [evaluate(one, scene.select(frames)) for one, frames in zip(found, sets, strict=True)]
+    return [float(np.mean([row[metric] for row in rows])) for metric in METRICS]
+
+
+def report(folder: Path) -> None:
+    """Print the tables of docs/guard.md."""
+    rooms = [files.read_json(file) for file in sorted(folder.glob("*.json"))]
+    domains = sorted({room["domain"] for room in rooms})
+    groups = {domain: [room for room in rooms if room["domain"] == domain] for domain in domains}
+    taught = [room for room in rooms if room["refused"] is None]
+    for domain, group in {**groups, "all": rooms, "all with cameras to learn": taught}.items():
+        with_cameras = sum(room["refused"] is None for room in group)
+        refined = [sum(name == "seen-12" for name, _ in room["bundle_refused"]) == 0 for room in group]
+        print(
+            f"\n{domain}: {len(group)} rooms, {with_cameras} with cameras to learn, {sum(refined)} refined as a whole"
+        )
+        for name in SCORED:
+            for metric in ("auc15", "auc30", "f1_rel5"):
+                print(
+                    f"  {name:9s} {metric:8s}", "  ".join(cell(group, way, name, metric) for way in ("frozen", *WAYS))
+                )
+
+
+def cell(rooms: list[dict], way: str, name: str, metric: str) -> str:
+    """Mean of the frozen score, or mean change against it with its interval and the worst room."""
+    column = METRICS.index(metric)
+    values = np.array([[room["scores"][w][name][column] for w in (way, "frozen")] for room in rooms])
+    if way == "frozen":
+        return f"frozen {values[:, 0].mean():.3f}"
+    change = values[:, 0] - values[:, 1]
+    mean, low, high = paired_interval(change)
+    return f"{way} {mean:+.3f} [{low:+.3f}, {high:+.3f}] worst {change.min():+.3f}"
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    recording = commands.add_parser("record")
+    recording.add_argument("-o", "--output", type=Path, required=True)
+    recording.add_argument("--domains", nargs="+", required=True)
+    recording.add_argument("--rooms", type=int, required=True)
+    recording.add_argument("--start", type=int, default=0)
+    recording.add_argument("--seed", type=int, default=43)
+    reporting = commands.add_parser("report")
+    reporting.add_argument("folder", type=Path)
+    options = parser.parse_args()
+    if options.command == "report":
+        report(options.folder)
+        return
+    torch.set_num_threads(1)
+    for room in range(options.start, options.start + options.rooms):
+        for domain in options.domains:
+            record(options.output, domain, room, options.seed)
+
+
+if __name__ == "__main__":
+    main()
