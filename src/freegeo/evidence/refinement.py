@@ -60,6 +60,11 @@ class RefineSettings:
     """Matching pixels that matches must move, in the median, beyond what a turn of the camera explains."""
     good: float = 0.5
     """Share of the observations that must fit in the end."""
+    proven: float = 0.5
+    """More than this share of the held-out pairs must fit to `proven_px`. Where photos hang together in a chain, no pair
+    can be held out without losing its photos: such cameras are a guess, however much better than before they fit."""
+    proven_px: float = 1.0
+    """Median epipolar error, in matching pixels, of a held-out pair that fits."""
     seed: int = 0
     """Of the folds and draws."""
 
@@ -344,6 +349,13 @@ def _judged(
     )
     if probability < settings.probability:
         return replace(result, reason=f"Matches that had no part in it do not clearly fit better ({numbers}).")
+    fitting = int((after[known] < settings.proven_px).sum())
+    if fitting <= settings.proven * count:
+        return replace(
+            result,
+            reason=f"Only {fitting} of {count} pairs that had no part in it fit to {settings.proven_px:g} px: too few "
+            "photos are seen from more than one other to prove their places.",
+        )
     return replace(result, accepted=True, reason=f"Matches that had no part in it fit better ({numbers}).")
 
 
