@@ -61,8 +61,8 @@ class RefineSettings:
     good: float = 0.5
     """Share of the observations that must fit in the end."""
     proven: float = 0.5
-    """More than this share of the held-out pairs must fit to `proven_px`. Where photos hang together in a chain, no pair
-    can be held out without losing its photos: such cameras are a guess, however much better than before they fit."""
+    """More than this share of the held-out pairs must fit to `proven_px`. Where photos hang together in a chain, none
+    of them can be held out without losing photos: such cameras are a guess, however well they fit."""
     proven_px: float = 1.0
     """Median epipolar error, in matching pixels, of a held-out pair that fits."""
     seed: int = 0
