@@ -29,7 +29,7 @@ def _package() -> ModuleType:
 
 @cache
 def _network():
-    """Load the network, once, on the CPU: the same image then gives the same result on every machine."""
+    """Load the network, once, on the CPU: a GPU that is there or not then changes nothing."""
     # The package prints where the weights are, and chooses a GPU by itself.
     with contextlib.redirect_stdout(io.StringIO()):
         network = _package().XFeat().eval()
