@@ -27,7 +27,8 @@ def photo_folder(tmp_path, monkeypatch):
     for photo in photograph_room(20_000_001, "test-id", frames=4).photos:
         Image.fromarray(photo.read()).resize((64, 48)).save(tmp_path / "photos" / photo.name)
     plain = recipe.scene
-    monkeypatch.setattr(recipe, "scene", lambda spec: replace(plain(spec), steps=2, sets_per_scene=2, distinct_seeds=2))
+    short = {"steps": 2, "sets_per_scene": 2, "distinct_seeds": 2}
+    monkeypatch.setitem(recipe.OWN, "scene", lambda spec: replace(plain(spec), **short))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

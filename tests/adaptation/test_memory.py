@@ -130,7 +130,7 @@ def images(count: int, side: int) -> SceneImages:
 
 
 @pytest.mark.parametrize(("place", "checkpointing"), [("device", False), ("disk", True)])
-@pytest.mark.parametrize("hold", [0.0, 1.0])
+@pytest.mark.parametrize("hold", [0.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_the_peak_is_that_of_the_tensors_alive(place, checkpointing, hold, tmp_path):
     model = wide_da3()
     recipe = scene(model.spec).changed(epochs=2, batch=2, sets_per_scene=2, distinct_seeds=2, rank=8, hold=hold)

@@ -230,7 +230,7 @@ def test_config_works_for_a_whole_run(freegeo, photo_folder, tiny, tmp_path):
         ("run x -o o --steps", "--steps needs a value: --steps N. "),
         ("run x -o o --lr", "--lr needs a value: --lr X. "),
         ("run x -o o --keep", "--keep needs a value: --keep TEXT. "),
-        ("run x -o o --recipe", "--recipe needs a value: --recipe scene|paper|released-da3|released-vggt. "),
+        ("run x -o o --recipe", "--recipe needs a value: --recipe scene|evidence|paper|released-da3|released-vggt. "),
         ("run x -o o --loss", "--loss needs a value: --loss TEXT. Settings of the loss, such as weight_kq=0"),
         ("run x", "`freegeo run` needs --output PATH. Folder for the results."),
         ("models describe", "`freegeo models describe` needs MODEL. "),

@@ -67,7 +67,7 @@ def test_the_help_names_the_defaults_of_the_recipe(freegeo, command):
         f"Default: {default.sets_per_scene} with recipe scene",
         f"Default: {default.lr:.0e} with recipe scene (freegeo-tiny: {rate})".replace("e-0", "e-"),
         f"Default: {default.rank} (freegeo-tiny: {small.rank}).",
-        f"Default: {default.hold:g} with recipe scene, else {PAPER.hold:g}.",
+        f"Default: {default.hold:g} with scene and evidence, else {PAPER.hold:g}.",
         f"Default: {default.views}.",
         "default: da3-base.",
     ):

@@ -6,6 +6,7 @@ import torch
 from tiny_models import noise, same, tiny_da3, tiny_vggt, trained
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
 @pytest.mark.parametrize(
     ("make", "options"), [(tiny_da3, {"reference": "saddle_balanced"}), (tiny_vggt, {"layers": (0,)})]

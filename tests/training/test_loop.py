@@ -155,6 +155,7 @@ def test_a_leg_stops_in_time_and_is_resumed(tmp_path, small_config):
     assert (tmp_path / "legs" / state.NEWEST_FILE).is_file()
 
 
+@pytest.mark.slow
 def test_two_workers_learn_on_the_same_weights(tmp_path, small_config):
     by_first_process = []
     weights = train(small_config, tmp_path / "two", workers=2, progress=lambda now: by_first_process.append(now.seen))
@@ -199,6 +200,7 @@ def test_a_step_that_is_not_finite_is_left_out_where_that_is_allowed(tmp_path, s
         train(config, tmp_path / "always")
 
 
+@pytest.mark.slow
 def test_the_next_version_is_trained_within_its_time_and_started_from_half_precision(
     tmp_path, small_config, monkeypatch
 ):

@@ -139,7 +139,7 @@ def _help(error: CycloptsError, argument: Argument) -> str:
         return "."
     known = error.app.assemble_argument_collection(parse_docstring=True).get(argument.name, None)
     text = None if known is None else known.parameter.help
-    return f". {text}" if text else "."
+    return f". {' '.join(text.split())}" if text else "."
 
 
 def _kind(argument: Argument) -> Any:
