@@ -152,6 +152,16 @@ def test_changed_reaches_the_loss_and_leaves_its_other_settings():
     assert scene.changed(loss=None) == scene.changed(loss={}) == scene
 
 
+def test_loss_settings_that_a_recipe_does_not_read_are_said(caplog):
+    plan = recipes.evidence(build_empty("da3-base").spec)
+    assert plan.changed(loss={"weight_huber": 0.5}).loss.weight_huber == 0.5
+    assert not caplog.records
+    plan.changed(loss={"weight_huber": 0.5, "weight_kq": 1.0})
+    assert caplog.messages == [
+        "--loss weight_kq: recipe 'evidence' compares no features of student and teacher, so this changes nothing."
+    ]
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

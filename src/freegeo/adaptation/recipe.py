@@ -237,8 +237,8 @@ class Recipe:
 
         Setting steps unsets epochs and the reverse; setting the rank sets alpha to it, and a rate below the final rate
         lowers that by the same factor as the rate, unless they are given too. `loss`
-        names settings of the loss, such as `{"weight_kq": 0.0}`; the others of the loss stay. UserError for a loss
-        setting that does not exist, and for invalid values.
+        names settings of the loss, such as `{"weight_kq": 0.0}`; the others of the loss stay, and what changes nothing
+        is said in a warning. UserError for a loss setting that does not exist, and for invalid values.
         """
         given = {name: value for name, value in changes.items() if value is not None}
         if loss:
@@ -249,9 +249,18 @@ class Recipe:
             given.setdefault("alpha", given["rank"])
         if given.get("lr", math.inf) < self.final_lr:
             given.setdefault("final_lr", self.final_lr * given["lr"] / self.lr)
-        return replace(self, **given)
+        changed = replace(self, **given)
+        idle = sorted(set(loss or ()) - _HELD)
+        if idle and not changed.features:
+            logger.warning(
+                "--loss %s: recipe '%s' compares no features of student and teacher, so this changes nothing.",
+                ", ".join(idle), self.name,
+            )  # fmt: skip
+        return changed
 
 
+_HELD = {"intra_tokens", "weight_huber", "weight_cosine", "huber_delta"}
+"""Settings of the loss that `hold` reads."""
 _OPTIONS = {
     "views": "--views", "steps": "--steps", "epochs": "--epochs", "sets_per_scene": "--sets", "lr": "--lr",
     "rank": "--rank",
