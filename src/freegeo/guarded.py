@@ -110,6 +110,8 @@ def judge_adapter(
     final = {name: value.detach().cpu().clone() for name, value in adapter.named_parameters().items()}
     kept = {**adapted.earlier, 1.0: final}
 
+    whole = State(steps=1.0, strength=1.0)
+
     def put(state: State) -> None:
         adapter.load(kept[state.steps])
         adapter.set_strength(state.strength)
@@ -129,9 +131,11 @@ def judge_adapter(
     try:
         verdict = try_states(predicted, references)
     finally:
-        put(State(steps=1.0, strength=1.0))
+        put(whole)
     if not select:
         used = "The adapter is used as it was trained (--guard report)."
+        if verdict.chosen is not None and verdict.chosen.state != whole:
+            used = f"That is with {verdict.chosen.state}. {used}"
     elif verdict.chosen is not None:
         put(verdict.chosen.state)
         adapter.settle()

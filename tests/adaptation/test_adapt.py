@@ -45,6 +45,16 @@ def wide_scene(views: int = 6) -> SceneImages:
     return SceneImages(name="wide", count=views, load=lambda frames: images[list(frames)])
 
 
+def test_every_share_is_kept_also_where_the_steps_are_fewer():
+    model = tiny_da3()
+    result = run(model, [wide_scene()], quick(model, steps=2), keep_after=(0.25, 0.5, 0.75))
+    assert sorted(result.earlier) == [0.25, 0.5, 0.75]
+    first, second, last = (result.earlier[share] for share in (0.25, 0.5, 0.75))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    final = result.adapter.named_parameters()
+    assert all(torch.equal(last[name], final[name]) for name in last)
+
+
 # The algorithm --------------------------------------------------------------------------------------------------------
 
 

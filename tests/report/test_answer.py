@@ -62,6 +62,9 @@ def test_an_adapter_that_did_not_help_is_not_used():
 def test_a_reported_verdict_leaves_the_adapter_in_use():
     reported = verdict("frozen", reason="Worse. The adapter is used as it was trained (--guard report).")
     assert rows(answer(summary(verdict=reported, adapter="adapter"))) == ["frozen", "adapted (used)"]
+    better = verdict("adapted", chosen=1, reason="Better. The adapter is used as it was trained (--guard report).")
+    found = answer(summary(verdict=better, adapter="adapter"))
+    assert rows(found) == ["frozen", "adapted (used)", "adapted, strength 0.5, 100 % of steps"]
 
 
 def test_too_few_matches_ask_for_more_overlap():

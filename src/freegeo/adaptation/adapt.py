@@ -209,7 +209,7 @@ def adapt(
         logger.info(said)
     steps = schedule([scene.count for scene in scenes], recipe, seed)
     plan = plan or plan_adaptation(model, scenes, recipe, visited(steps), compute=compute, folder=resume_in)
-    wanted = {max(1, round(share * len(steps))): share for share in keep_after}
+    wanted = {share: max(1, round(share * len(steps))) for share in keep_after}
     run = _Run(model.adaptable(), scenes, recipe, steps, seed, compute, resume_in, on_step, on_epoch, wanted)
     try:
         return _train(run, plan)
@@ -253,8 +253,8 @@ class _Run:
     folder: Path | None
     on_step: Callable[[Progress], None]
     on_epoch: Callable[[int, Adapter], None]
-    keep_after: Mapping[int, float]
-    """Numbers of finished steps after which the adapter's state is kept -> their share of the steps."""
+    keep_after: Mapping[float, int]
+    """Shares of the steps after which the adapter's state is kept -> how many finished steps that are."""
 
 
 def _train(run: _Run, plan: Plan) -> Adapted:
@@ -435,7 +435,8 @@ class _State:
         self.scaler.step(self.optimiser)
         self.scaler.update()
         self.next_step += 1
-        if share := self.run.keep_after.get(self.next_step):
+        # In a very short run several shares are the same step.
+        for share in [share for share, step in self.run.keep_after.items() if step == self.next_step]:
             named = self.result.adapter.named_parameters()
             self.result.earlier[share] = {name: value.detach().cpu().clone() for name, value in named.items()}
 
@@ -504,5 +505,5 @@ class _State:
         model, recipe = self.run.model.spec.name, asdict(self.run.recipe)
         about = {"model": model, "scenes": scenes, "recipe": recipe, "seed": self.run.seed}
         about["precision"] = self.run.compute.precision
-        about["keep_after"] = sorted(self.run.keep_after.values())
+        about["keep_after"] = sorted(self.run.keep_after)
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from freegeo.types import PhotoLike
 
 DEMO = "demo"
-DEMO_DOMAIN = "light"
+DEMO_DOMAIN = "big"
 DEMO_FRAMES = 16
 
 

@@ -96,13 +96,14 @@ def _rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     trials, chosen = verdict.get("trials") or [], verdict.get("chosen")
     is_adapted, refined = bool(summary.get("adapter")), bool(told.get("accepted"))
     frozen = verdict.get("frozen") or told.get("frozen") or (None if is_adapted else told.get("before"))
+    as_trained = verdict.get("reason", "").endswith("(--guard report).")
     adapted: list[tuple[str, Mapping[str, Any], bool]] = []
     for number, trial in enumerate(trials):
         whole = trial["steps"] == trial["strength"] == 1
         if whole or number == chosen:
             state = "" if whole else f", strength {trial['strength']:g}, {100 * trial['steps']:g} % of steps"
-            used = is_adapted and (number == chosen or (whole and verdict["reason"].endswith("(--guard report).")))
-            adapted.append((f"adapted{state}", trial, used))
+            used = whole if as_trained else number == chosen
+            adapted.append((f"adapted{state}", trial, is_adapted and used))
     if is_adapted and not adapted and told.get("before"):
         adapted = [("adapted", told["before"], True)]
     rows = [("frozen", frozen, not is_adapted), *adapted]
