@@ -12,14 +12,12 @@ of the change against the frozen model, with paired 95 % intervals. Where the ph
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
-from guard import ADAPTED_TO, SETS
+from guard import ADAPTED_TO, SETS, command_line
 
 from freegeo import files
 from freegeo.adaptation import recipe as recipes
@@ -123,27 +121,5 @@ def cell(rooms: list[dict], way: str, name: str, metric: str) -> str:
     return f"{way} {mean:+.3f} [{low:+.3f}, {high:+.3f}] worst {change.min():+.3f}"
 
 
-def main() -> None:
-    """Read the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(dest="command", required=True)
-    recording = commands.add_parser("record")
-    recording.add_argument("-o", "--output", type=Path, required=True)
-    recording.add_argument("--domains", nargs="+", required=True)
-    recording.add_argument("--rooms", type=int, required=True)
-    recording.add_argument("--start", type=int, default=0)
-    recording.add_argument("--seed", type=int, default=43)
-    reporting = commands.add_parser("report")
-    reporting.add_argument("folder", type=Path)
-    options = parser.parse_args()
-    if options.command == "report":
-        report(options.folder)
-        return
-    torch.set_num_threads(1)
-    for room in range(options.start, options.start + options.rooms):
-        for domain in options.domains:
-            record(options.output, domain, room, options.seed)
-
-
 if __name__ == "__main__":
-    main()
+    command_line(__doc__, record, report)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -210,17 +211,18 @@ def _rank(rooms: list[Room], score: str, name: str, metric: str) -> float:
     return float(spearmanr(true, told).statistic)
 
 
-def main() -> None:
-    """Read the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def command_line(about: str, record: Callable[..., None], report: Callable[[Path], None], **more: float) -> None:
+    """Run `record` for every room that the command line names, or `report`; `more` are further options of `record`."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     recording = commands.add_parser("record")
     recording.add_argument("-o", "--output", type=Path, required=True)
     recording.add_argument("--domains", nargs="+", required=True)
     recording.add_argument("--rooms", type=int, required=True)
     recording.add_argument("--start", type=int, default=0)
-    recording.add_argument("--hold", type=float, default=1.0)
     recording.add_argument("--seed", type=int, default=43)
+    for name, default in more.items():
+        recording.add_argument(f"--{name}", type=float, default=default)
     reporting = commands.add_parser("report")
     reporting.add_argument("folder", type=Path)
     options = parser.parse_args()
@@ -230,8 +232,9 @@ def main() -> None:
     torch.set_num_threads(1)
     for room in range(options.start, options.start + options.rooms):
         for domain in options.domains:
-            record(options.output, domain, room, hold=options.hold, seed=options.seed)
+            given = {name: getattr(options, name) for name in more}
+            record(options.output, domain, room, seed=options.seed, **given)
 
 
 if __name__ == "__main__":
-    main()
+    command_line(__doc__, record, report, hold=1.0)
