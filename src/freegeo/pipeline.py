@@ -283,10 +283,8 @@ def adapt(
             model, images, plan, seed=seed, compute=compute, resume_in=folder, on_step=follow,
             keep_after=() if guard == "off" else SHARES,
         )  # fmt: skip
-    if result.trouble:
-        logger.warning("%s", _capital(result.trouble))
-        return result
-    judge_by_photos(model, result, [(found, batch)], compute=compute, guard=guard, frozen=frozen, judging=judging)
+    if not result.trouble:
+        judge_by_photos(model, result, [(found, batch)], compute=compute, guard=guard, frozen=frozen, judging=judging)
     if result.trouble:
         logger.warning("%s", _capital(result.trouble))
     return result
