@@ -1,0 +1,1 @@
+"""Known cameras: reading, checking, converting."""
