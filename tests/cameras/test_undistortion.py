@@ -211,6 +211,12 @@ def test_lenses_that_cannot_be_undistorted(camera, words):
         undistort(grey(), camera)
 
 
+def test_photos_too_large_for_opencv_are_refused():
+    photo = MemoryPhoto("pano.png", np.broadcast_to(np.zeros(3, np.uint8), (10, 32_767, 3)))
+    with pytest.raises(UserError, match="pano.png: the lens .RADIAL. cannot be undistorted: sides of more than 32766"):
+        undistort(photo, KnownCamera(K=np.array([[9e3, 0, 16e3], [0, 9e3, 5], [0, 0, 1]]), lens=EXAMPLES[1]))
+
+
 def test_a_fold_of_the_polynomial_is_never_shown():
     """Beyond a radius this lens bends rays back into the image; the undistorted photo ends before."""
     photo = undistort(grey(), KnownCamera(K=K, lens=Lens("SIMPLE_RADIAL", (-0.6,))))

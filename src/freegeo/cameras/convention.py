@@ -44,6 +44,8 @@ FEWEST_MATCHES = 40
 """With fewer matches there is nothing to judge by."""
 FLAT = 0.8
 """Share of a pair's matches on one homography from which it is a turn on the spot or a flat scene."""
+SAME_TURN_DEG, SAME_WAY_DEG = 0.5, 2.0
+"""Relative poses that differ by less, in rotation and in the direction of the way, are the same."""
 OF_A_PHOTO, MOST_GOOD = 3, 0.3
 """A photo is judged by itself when so many of its pairs have an error; it fits when at least this share is small."""
 SEARCHED_MATCHES = 40
@@ -171,7 +173,11 @@ def _verdict(known: KnownCameras, matches: Matches, found: Convention, judged: n
             f"{found.pairs} pairs). Look at the result, or give photos that overlap more."
         )
     ranked = {reading: np.inf if found.behind[reading] else error for reading, error in found.errors.items()}
-    best, second = sorted(ranked, key=ranked.__getitem__)[:2]
+    best = min(ranked, key=ranked.__getitem__)
+    if _same_cameras(known, matches.pairs, best, own):
+        best = own
+    rivals = [reading for reading in READINGS if not _same_cameras(known, matches.pairs, best, reading)]
+    second = min(rivals or set(READINGS) - {best}, key=ranked.__getitem__)
     decided = ranked[best] * CLEARLY <= ranked[second]
     if ranked[best] >= LARGEST_PX:
         return "refused", (
@@ -204,6 +210,25 @@ def _verdict(known: KnownCameras, matches: Matches, found: Convention, judged: n
         f"the next reading {found.errors[second]:.2g} px"
         + (" with the points behind the cameras." if found.behind[second] else ".")
     )
+
+
+def _same_cameras(known: KnownCameras, pairs: np.ndarray, reading: str, another: str) -> bool:
+    """Whether two readings have the same relative poses, but for a degree or two, so that the choice is no matter.
+
+    Straight ahead without a turn, world-to-camera with OpenCV axes is camera-to-world with OpenGL axes, the world
+    flipped.
+    """
+    poses = {view: one.T_cam_world for view, one in enumerate(known.cameras) if one.T_cam_world is not None}
+    matrices = {view: matrix_of(T, known.convention) for view, T in poses.items()}
+    turns, ways = [], []
+    for i, j in pairs.tolist():
+        one, two = (pose_of(matrices[j], r) @ _inverse(pose_of(matrices[i], r)) for r in (reading, another))
+        cosine = (np.trace(one[:3, :3].T @ two[:3, :3]) - 1) / 2
+        turns.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        lengths = np.linalg.norm(one[:3, 3]) * np.linalg.norm(two[:3, 3])
+        cosine = one[:3, 3] @ two[:3, 3] / lengths if lengths > 0 else 1.0
+        ways.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    return max(turns) < SAME_TURN_DEG and max(ways) < SAME_WAY_DEG
 
 
 def _odd_photos(known: KnownCameras, matches: Matches, errors: np.ndarray) -> list[str]:

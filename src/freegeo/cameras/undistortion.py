@@ -36,6 +36,8 @@ SMALLEST_SLOPE = 0.1
 """How much of the way of a ray the lens must show, at least; at a fold it is nothing."""
 _SCALES = (0.05, 8.0)
 """Focal lengths of the undistorted photo that are tried, in those of the original."""
+LONGEST_SIDE = 32_766
+"""What OpenCV can resample."""
 _BORDER, _ALONG = 64, 16
 """Points on each side of the border, and on the way to each of them, at which the lens is looked at."""
 
@@ -114,6 +116,8 @@ def undistort(photo: PhotoLike, camera: KnownCamera) -> UndistortedPhoto:
     require_lens(camera.lens)
     fx, fy, (height, width) = camera.K[0, 0], camera.K[1, 1], photo.size_hw
     try:
+        if max(height, width) > LONGEST_SIDE:
+            raise ValueError(f"sides of more than {LONGEST_SIDE} pixels cannot be resampled")
         scale = _scale(camera.lens, tuple(camera.K.ravel().tolist()), photo.size_hw)
     except ValueError as error:
         raise UserError(
