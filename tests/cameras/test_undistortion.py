@@ -165,7 +165,7 @@ def test_a_fisheye_of_150_degrees_loses_field_of_view_and_says_so(caplog):
     assert field == pytest.approx(110)
     places = photo.to_original(border())
     assert (places >= 0).all() and (places <= HW[::-1]).all()
-    assert caplog.messages == ["1 photos are undistorted; a.png shows 110 x 94 of 150 x 112 degrees afterwards."]
+    assert caplog.messages == ["1 of 1 photos are undistorted; a.png shows 110 x 94 of 150 x 112 degrees afterwards."]
 
 
 def test_a_weak_lens_is_no_doubt(caplog):
@@ -213,7 +213,7 @@ def test_lenses_that_cannot_be_undistorted(camera, words):
 
 def test_photos_too_large_for_opencv_are_refused():
     photo = MemoryPhoto("pano.png", np.broadcast_to(np.zeros(3, np.uint8), (10, 32_767, 3)))
-    with pytest.raises(UserError, match="pano.png: the lens .RADIAL. cannot be undistorted: sides of more than 32766"):
+    with pytest.raises(UserError, match=r"pano.png: the lens .RADIAL. cannot be undistorted: sides of more than 32766"):
         undistort(photo, KnownCamera(K=np.array([[9e3, 0, 16e3], [0, 9e3, 5], [0, 0, 1]]), lens=EXAMPLES[1]))
 
 

@@ -153,11 +153,11 @@ def undistorted(photos: Sequence[PhotoLike], known: KnownCameras) -> tuple[list[
         new_photos.append(photo)
         cameras.append(camera)
     if done:
-        _say_fields(done)
+        _say_fields(done, len(photos))
     return new_photos, replace(known, cameras=tuple(cameras))
 
 
-def _say_fields(photos: list[UndistortedPhoto]) -> None:
+def _say_fields(photos: list[UndistortedPhoto], count: int) -> None:
     """Log how much of the field of view is left, of the photo that loses most."""
     before, after, photo = max(
         ((before, after, photo) for photo in photos for before, after in [_fields(photo)]),
@@ -166,8 +166,8 @@ def _say_fields(photos: list[UndistortedPhoto]) -> None:
     lost = max(a - b for a, b in zip(before, after, strict=True))
     logger.log(
         logging.WARNING if lost > WORTH_SAYING_DEG else logging.INFO,
-        "%d photos are undistorted; %s shows %.0f x %.0f of %.0f x %.0f degrees afterwards.",
-        len(photos), photo.name, *after, *before,
+        "%d of %d photos are undistorted; %s shows %.0f x %.0f of %.0f x %.0f degrees afterwards.",
+        len(photos), count, photo.name, *after, *before,
     )  # fmt: skip
 
 

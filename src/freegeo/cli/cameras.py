@@ -18,6 +18,8 @@ from freegeo.errors import UserError
 if TYPE_CHECKING:
     from freegeo.cameras.known import KnownCamera, KnownCameras
 
+SHOWN = 5
+"""Most different intrinsics that are listed."""
 app = App(name="cameras", help="Check known cameras against photos, and convert them.", help_format="plaintext")
 
 
@@ -126,8 +128,9 @@ def described(known: KnownCameras) -> list[str]:
     """Return what is known, as lines of text."""
     count, poses, K = len(known), int(known.has_pose.sum()), int(known.has_K.sum())
     lines = [f"{known.source}: poses of {poses} of {count} photos, intrinsics of {K}{', metres' * known.metric}"]
-    lines += [f"  {text}" for text in dict.fromkeys(_optics(one) for one in known.cameras if one.K is not None)]
-    return lines
+    optics = list(dict.fromkeys(_optics(one) for one in known.cameras if one.K is not None))
+    lines += [f"  {text}" for text in optics[:SHOWN]]
+    return [*lines, f"  and {len(optics) - SHOWN} other intrinsics"] if len(optics) > SHOWN else lines
 
 
 def _optics(one: KnownCamera) -> str:
