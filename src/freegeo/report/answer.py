@@ -142,7 +142,7 @@ def _advice(summary: Mapping[str, Any], parts: list[Part]) -> Iterator[str]:
     if adaptation == "unknown" and not verdict and summary.get("filters") is not None:
         yield "--guard select: let the matches decide whether the adapter is used."
     if adaptation == "no" and "Refinement" not in outcomes and summary.get("filters") is not None:
-        yield "--refine ba: bring the cameras to the matches by bundle adjustment instead."
+        yield "--refine ba: bring the cameras to the matches by bundle adjustment (pip install 'freegeo[colmap]')."
     if adaptation == "no" and verdict:
         recipe = summary["recipe"]
         steps = f" (now {recipe['steps']})" if recipe.get("steps") else ""
