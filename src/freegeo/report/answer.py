@@ -96,7 +96,7 @@ def _rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     trials, chosen = verdict.get("trials") or [], verdict.get("chosen")
     is_adapted, refined = bool(summary.get("adapter")), bool(told.get("accepted"))
     frozen = verdict.get("frozen") or told.get("frozen") or (None if is_adapted else told.get("before"))
-    as_trained = verdict.get("reason", "").endswith("(--guard report).")
+    as_trained = verdict.get("used") == "adapter"
     adapted: list[tuple[str, Mapping[str, Any], bool]] = []
     for number, trial in enumerate(trials):
         whole = trial["steps"] == trial["strength"] == 1
