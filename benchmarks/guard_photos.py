@@ -131,7 +131,8 @@ def main() -> None:
     print(table(rows))
     if arguments.out:
         settings = {"sizes_deg": SIZES_DEG, "same": SAME, "other": OTHER, "seeds": arguments.seeds}
-        write_result(arguments.out, settings=settings, results={"rows": rows}, show=False)
+        wrong = [row for row in rows if row["accepted"] != (truly(row) == "better") and truly(row) != "equal"]
+        write_result(arguments.out, settings=settings, results={"table": table(rows), "wrong": wrong}, show=False)
 
 
 if __name__ == "__main__":
