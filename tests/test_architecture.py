@@ -17,7 +17,6 @@ ALLOWED = {
     "refined": {"data", "evidence", "export", "fusion", "guarded", "models"},
     "taught": {"adaptation", "evidence", "export", "geometry", "guarded"},
     "progress": {"adaptation"},
-    "cameras": {"data", "evidence", "geometry"},
     "benchmark": {"adaptation", "models", "data", "fusion", "metrics", "geometry"},
     "training": {"models", "data", "metrics", "geometry"},
     "adaptation": {"models", "data.scene", "geometry"},
