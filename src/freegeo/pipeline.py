@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import torch
@@ -48,7 +48,7 @@ from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import EMBEDDED_MODEL, warn_of_embedded_model
 from freegeo.models.images import read_photos
 from freegeo.models.precision import Compute
-from freegeo.models.spec import MIXED, Mixed, ModelSpec
+from freegeo.models.spec import MIXED, Mixed, ModelSpec, PoseFrom
 from freegeo.progress import step_bar
 from freegeo.refined import refine_by_photos
 from freegeo.report.page import write_report
@@ -87,7 +87,12 @@ _warned_of: list[str] = []
 
 @torch.no_grad()
 def predict(
-    model: ReconstructionModel, batch: ImageBatch, *, reference: str | None = None, compute: Compute = CPU
+    model: ReconstructionModel,
+    batch: ImageBatch,
+    *,
+    reference: str | None = None,
+    pose_from: PoseFrom = "camera",
+    compute: Compute = CPU,
 ) -> Reconstruction:
     """Reconstruct prepared images with the model and the adapter that is on, if any.
 
@@ -95,7 +100,7 @@ def predict(
     nothing else. UserError when the images do not fit into memory together, FreeGeoError when the model answers with
     values that are not finite.
     """
-    result = _predict(model, batch, reference=reference, compute=compute)
+    result = _predict(model, batch, reference=reference, pose_from=pose_from, compute=compute)
     trouble = not_finite(result)
     if trouble:
         raise FreeGeoError(f"{trouble} Try --precision fp32, and check the weights.")
@@ -103,14 +108,26 @@ def predict(
 
 
 def _predict(
-    model: ReconstructionModel, batch: ImageBatch, *, reference: str | None, compute: Compute
+    model: ReconstructionModel, batch: ImageBatch, *, reference: str | None, pose_from: PoseFrom, compute: Compute
 ) -> Reconstruction:
     plan_reconstruction(model, len(batch), batch.image_hw, compute=compute)
     model.to(compute.device).eval()
     with compute.autocast():
         tokens = embed_in_chunks(model, batch.images, device=compute.device)
-        prediction = model.decode(model.aggregate(tokens, reference=reference or model.spec.reference))
+        features = model.aggregate(tokens, reference=reference or model.spec.reference)
+        if pose_from == "rays":
+            prediction = model.decode(features, want=("depth", "ray_cameras"))
+        else:
+            prediction = model.decode(features)
     return Reconstruction.from_prediction(prediction, batch)
+
+
+def require_pose_from(spec: ModelSpec, pose_from: PoseFrom) -> None:
+    """Raise UserError when cameras cannot come from there."""
+    if pose_from not in get_args(PoseFrom):
+        raise UserError(f"cameras come from {' or '.join(get_args(PoseFrom))}, not {pose_from!r}.")
+    if pose_from == "rays" and not spec.ray_cameras:
+        raise UserError(f"{spec.name} finds no cameras from rays; only the any-view models of Depth Anything 3 do.")
 
 
 def _capital(sentence: str) -> str:
@@ -138,6 +155,7 @@ def reconstruct(
     precision: str | None = None,
     max_views: int = MAX_VIEWS,
     mixed: Mixed = MIXED,
+    pose_from: PoseFrom = "camera",
 ) -> Reconstruction:
     """Reconstruct photos: depth, confidence and cameras of every view.
 
@@ -153,16 +171,19 @@ def reconstruct(
         mixed: how photos of different shapes become images of one size: `crop` fits the odd ones to the others, `pad`
             puts white around all, `upstream` is the rule of the model's authors. Cutting more than 10 % of a photo
             gives a warning.
+        pose_from: `camera`: cameras of the model's camera head; `rays`: found from the rays that an any-view model of
+            DA3 predicts.
 
     Raises:
         UserError: an argument that cannot be used, or views that do not fit into memory together.
     """
     _require_model(model)
-    _warn_of_embedded_model(model)
+    require_pose_from(model.spec, pose_from)
+    _warn_of_model(model)
     compute = Compute.choose(device, precision)
     batch = read_photos(model, load_photos(photos, max_views), mixed=mixed)
     with _applied(model, adapter):
-        return predict(model, batch, reference=reference, compute=compute)
+        return predict(model, batch, reference=reference, pose_from=pose_from, compute=compute)
 
 
 def _applied(model: ReconstructionModel, adapter: Adapter | str | Path | None) -> AbstractContextManager[None]:
@@ -262,7 +283,8 @@ def adapt(
         NoEvidenceError: recipe `evidence`, and the matches between the photos prove no cameras.
     """
     _require_model(model)
-    _warn_of_embedded_model(model)
+    model.adaptable()
+    _warn_of_model(model)
     compute = Compute.choose(device, precision)
     plan = _recipe(recipe, model, dataset).changed(
         steps=steps, epochs=epochs, lr=lr, rank=rank, hold=hold, views=views,
@@ -340,6 +362,7 @@ def judge_by_photos(
     frozen: Sequence[Reconstruction] | None = None,
     stores: Sequence[Path | None] | None = None,
     judging: Sequence[Matches] | None = None,
+    pose_from: PoseFrom = "camera",
 ) -> None:
     """Judge a finished adapter by the photos of its scenes, and keep the verdict in the result.
 
@@ -355,16 +378,20 @@ def judge_by_photos(
         frozen: predictions without the adapter; None: they are made here.
         stores: files for the matches of the scenes; None: they are not stored.
         judging: the matches that judge, where others taught; None: all matches of the photos.
+        pose_from: where cameras of predictions come from.
     """
 
     def predicted(batch: ImageBatch) -> Reconstruction | None:
-        found = _predict(model, batch, reference=reference, compute=compute)
+        found = _predict(model, batch, reference=reference, pose_from=pose_from, compute=compute)
         return found if not_finite(found) is None else None
 
     if frozen is None:
         try:
             with result.adapter.off():
-                frozen = [predict(model, batch, reference=reference, compute=compute) for _, batch in scenes]
+                frozen = [
+                    predict(model, batch, reference=reference, pose_from=pose_from, compute=compute)
+                    for _, batch in scenes
+                ]
         except UserError as error:
             if guard != "off":
                 raise
@@ -373,7 +400,7 @@ def judge_by_photos(
     asked = guard != "off" and all(one.has_cameras for one in frozen)
     if not asked or guard == "report":
         for (_, batch), before in zip(scenes, frozen, strict=True):
-            found = _predict(model, batch, reference=reference, compute=compute)
+            found = _predict(model, batch, reference=reference, pose_from=pose_from, compute=compute)
             wrong = not_finite(found) or harm(before, found)
             if wrong:
                 result.harm = f"{wrong} Lower --lr (now {result.recipe.lr:g}) or take fewer --steps."
@@ -408,10 +435,15 @@ def _require_model(model: object) -> None:
     raise UserError(f"model is a loaded model, not {type(model).__name__}. Load it with {hint}.")
 
 
-def _warn_of_embedded_model(model: ReconstructionModel) -> None:
-    """Say once what the embedded model is not for."""
-    if model.spec.name == EMBEDDED_MODEL and not _warned_of:
-        _warned_of.append(EMBEDDED_MODEL)
+def _warn_of_model(model: ReconstructionModel) -> None:
+    """Say once what a model is not for, or what its results lack."""
+    name, caution = model.spec.name, model.spec.caution
+    if name in _warned_of or not (caution or name == EMBEDDED_MODEL):
+        return
+    _warned_of.append(name)
+    if caution:
+        logger.warning("%s", caution)
+    else:
         warn_of_embedded_model()
 
 
@@ -458,6 +490,8 @@ class Job:
     """A saved adapter to reconstruct with, instead of training one."""
     guard: Guard = "select"
     """Whether the photos' matches judge the adapter, and whether their verdict decides what is used."""
+    pose_from: PoseFrom = "camera"
+    """Where the cameras of all predictions come from."""
     refine: bool = False
     """Whether the cameras are brought to the matches between the photos by bundle adjustment."""
     seed: int = SEED
@@ -531,7 +565,9 @@ class Job:
         if self.adapter is not None:
             assert self.in_place is not None
         with self._timed(stage):
-            result = predict(self.model, self.batch, reference=self.reference, compute=self.compute)
+            result = predict(
+                self.model, self.batch, reference=self.reference, pose_from=self.pose_from, compute=self.compute
+            )
             result.save(folder)
         return result
 
@@ -574,6 +610,7 @@ class Job:
                 judge_by_photos(
                     self.model, result, [(self.photos, self.batch)], compute=self.compute, guard=self.guard,
                     reference=self.reference, frozen=[frozen], stores=stores, judging=judging,
+                    pose_from=self.pose_from,
                 )  # fmt: skip
                 seconds["evidence"] = round(time.monotonic() - started, 2)
             result.save(folder)
@@ -589,7 +626,9 @@ class Job:
             return (Reconstruction.load(self._unrefined), None) if rejected is None else (frozen, rejected)
         assert self.in_place is not None
         with self._timed("adapted prediction"):
-            result = _predict(self.model, self.batch, reference=self.reference, compute=self.compute)
+            result = _predict(
+                self.model, self.batch, reference=self.reference, pose_from=self.pose_from, compute=self.compute
+            )
             rejected = not_finite(result)
             if rejected is None:
                 result.save(path)
@@ -671,6 +710,7 @@ class Job:
             "refinement": {k: v for k, v in self._noted("refinement").items() if k != "seconds"} or None,
             "frozen_prediction": None if self.recipe is None else f"{FROZEN_FOLDER}/{PREDICTION_NAME}",
             "reference_view": self.reference or self.spec.reference,
+            "pose_from": self.pose_from if self.spec.cameras else None,
             "not_written": dict(failed),
             "warnings": list(self.warnings),
             "loss": self._loss_change(),

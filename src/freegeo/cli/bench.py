@@ -360,7 +360,10 @@ def _has_own(entry: Experiment, tables: Sequence) -> bool:
 def _adaptation(model: str) -> AdaptationDefaults:
     from freegeo.models.catalog import build_empty
 
-    return build_empty(model).spec.adaptation
+    spec = build_empty(model).spec
+    if not spec.cameras:
+        raise UserError(f"{spec.name} predicts no cameras, which the benchmark scores. Choose another model.")
+    return spec.adaptation
 
 
 def _rule(bench: BenchOptions, model: str) -> FrameRule:

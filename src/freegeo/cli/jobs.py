@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -11,20 +12,23 @@ from typing import TYPE_CHECKING, Any
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
 from freegeo.cli.files import FileOptions, require_complete
-from freegeo.cli.options import ModelOptions, OutputOptions, RecipeOptions
+from freegeo.cli.options import ModelOptions, OutputOptions, RecipeOptions, Refine, refines
+from freegeo.errors import UserError
 from freegeo.export import reconstruction as npz
 from freegeo.export.base import KEPT_NAME, TRACKS_NAME
 from freegeo.export.formats import FORMATS
 from freegeo.export.photos import FOLDER as COPIES_FOLDER
 from freegeo.export.photos import write_copies
 from freegeo.files import read_json
-from freegeo.models.spec import MIXED, Mixed
+from freegeo.models.spec import MIXED, Mixed, PoseFrom
 from freegeo.progress import step_bar
 from freegeo.run_folder import check_folder, run_folder, stored_state
 
 if TYPE_CHECKING:
     from freegeo.pipeline import Hooks, Job
     from freegeo.types import PhotoLike
+
+logger = logging.getLogger(__name__)
 
 DEFAULT_FILES = FileOptions()
 _OTHER_CONTENTS = "photos with other contents"
@@ -44,6 +48,7 @@ LABELS = {
             "keep", "room", "domain", "published", "guard",
         )
     },
+    "pose_from": "--pose-from",
 }  # fmt: skip
 """What messages call the settings of an output folder."""
 FILES = {
@@ -80,7 +85,8 @@ def run_job(
     mixed: Mixed = MIXED,
     files: FileOptions = DEFAULT_FILES,
     guard: Guard = "select",
-    refine: bool = False,
+    refine: Refine = "off",
+    pose_from: PoseFrom = "camera",
     extra_settings: dict[str, Any] | None = None,
     after: Callable[[Job], None] = lambda job: None,
 ) -> None:
@@ -92,14 +98,22 @@ def run_job(
     """
     from freegeo.data.video import VideoFrame
     from freegeo.models.images import read_photos
-    from freegeo.pipeline import PARTS, SUMMARY_NAME, Job, require_enough_photos, scene_images
+    from freegeo.pipeline import PARTS, SUMMARY_NAME, Job, require_enough_photos, require_pose_from, scene_images
 
     check_place(output)
-    formats = files.all_formats(output, photos)
     empty = model_options.build_empty()
+    formats = files.all_formats(output, photos, has_cameras=empty.spec.cameras)
+    require_pose_from(empty.spec, pose_from)
+    refining = refines(refine) and empty.spec.cameras
+    if refine == "ba" and not refining:
+        raise UserError(f"{empty.spec.name} predicts no cameras, so there are none to refine. Leave --refine out.")
+    if recipe is not None:
+        empty.adaptable()
     plan = None if recipe is None else recipe.build(empty.spec)
     if plan is not None:
         require_enough_photos(photos)
+    if empty.spec.caution:
+        logger.warning("%s", empty.spec.caution)
     masks = files.checked_masks(photos)
     batch = read_photos(empty, photos, mixed=mixed)
     adaptation = {
@@ -112,8 +126,12 @@ def run_job(
         "command": command,
         **(extra_settings or {}),
         "adaptation": adaptation,
-        "prediction": {"reference": model_options.reference or empty.spec.reference},
-        "refinement": "ba" if refine else "off",
+        "prediction": {
+            "reference": model_options.reference or empty.spec.reference,
+            # Only where it is not the default, so that folders of earlier versions count as finished.
+            **({} if pose_from == "camera" else {"pose_from": pose_from}),
+        },
+        "refinement": "ba" if refining else "off",
         "filters": files.filter_settings(masks),
         "formats": formats,
     }
@@ -129,7 +147,7 @@ def run_job(
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), warnings=console.warned(), after=after, formats=formats, photos=photos,
             filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity, guard=guard,
-            refine=refine,
+            refine=refining, pose_from=pose_from,
             scene=None if plan is None else lambda model: scene_images("photos", photos, model, plan, batch),
         )  # fmt: skip
         summary = job.run()

@@ -8,6 +8,7 @@ from freegeo.cli.files import FileOptions
 from freegeo.cli.jobs import DEFAULT_FILES, run_job
 from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, Refine, refines
 from freegeo.cli.sources import load_source
+from freegeo.models.spec import PoseFrom
 
 DEFAULT_MODEL, DEFAULT_PHOTOS = ModelOptions(), PhotoOptions()
 
@@ -20,6 +21,7 @@ def reconstruct(
     files: FileOptions = DEFAULT_FILES,
     adapter: Path | None = None,
     refine: Refine = "off",
+    pose_from: PoseFrom = "camera",
 ) -> None:
     """Reconstruct photos; one photo is enough.
 
@@ -33,10 +35,12 @@ def reconstruct(
     refine
         ba: bring the cameras to the matches between the photos by bundle adjustment, where matches that had no part in
         it then fit better (needs the extra: pip install 'freegeo[colmap]'); auto: ba where the extra is installed; off.
+    pose_from
+        camera: cameras of the model's camera head; rays: found from the rays that it predicts (any-view models of DA3).
     """
     from freegeo.adaptation.adapter_files import find_adapter
 
-    refining = refines(refine)
+    refines(refine)  # refused, where it has to be, before photos are read
     if adapter is not None:
         adapter = find_adapter(adapter)
         model = model.for_adapter(adapter)
@@ -44,5 +48,5 @@ def reconstruct(
     model.warn_of_embedded(sources)
     run_job(
         found, model, output, command="reconstruct", recipe=None, adapter=adapter, mixed=photos.mixed, files=files,
-        refine=refining,
+        refine=refine, pose_from=pose_from,
     )  # fmt: skip
