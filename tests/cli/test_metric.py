@@ -71,6 +71,13 @@ def test_what_needs_cameras_or_several_views_is_refused_before_anything_is_writt
     assert not (tmp_path / "out").exists()
 
 
+def test_scores_of_cameras_are_refused(freegeo, tmp_path):
+    for command in (["models", "score"], ["bench", "run", "main", "--quick", "--frames", "da3", "--model"]):
+        outcome = freegeo(*command, "tiny-single-view", "-o", tmp_path / "out")
+        assert outcome.code == 2
+        assert "tiny-single-view predicts no cameras" in outcome.sentence()
+
+
 def test_a_metric_model_gives_metres_frozen_and_adapted(freegeo, photo_folder, tmp_path):
     out = tmp_path / "out"
     outcome = freegeo("run", photo_folder, "-o", out, "--model", "tiny-nested", *OPTIONS, "--lr", "1e-6")

@@ -370,7 +370,8 @@ def _rule(bench: BenchOptions, model: str) -> FrameRule:
     """Return the frame rule of a run: the one asked for, or that of the model's family."""
     from freegeo.benchmark.tasks import family_rule
 
-    return bench.frames or family_rule(_adaptation(model))
+    own = family_rule(_adaptation(model))
+    return bench.frames or own
 
 
 def _figures(bench: BenchOptions) -> None:

@@ -198,6 +198,8 @@ def score(
         loaded = trained_model(checkpoint)
     else:
         loaded = catalog.load_model(model, checkpoint=checkpoint)
+    if not loaded.spec.cameras:
+        raise UserError(f"{loaded.spec.name} predicts no cameras, which the report card scores. Choose another model.")
     use_few_threads(loaded)
     with progress_bar("domains", len(names)) as update:
         card = report_card(
