@@ -4,6 +4,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -11,7 +12,9 @@ from safetensors.torch import load_file, save_file
 TESTS = Path(__file__).parents[1]
 sys.path.append(str(TESTS))  # the parity modules are shared with the full parity run and lie beside this folder
 
+import freegeo  # noqa: E402
 from fixture_tools import relative_error  # noqa: E402
+from freegeo import pipeline  # noqa: E402
 from freegeo.errors import UserError  # noqa: E402
 from freegeo.fusion.settings import FilterSettings  # noqa: E402
 from freegeo.models import catalog, da3_config  # noqa: E402
@@ -84,6 +87,21 @@ def test_what_a_single_view_model_cannot_do_is_refused():
         model.aggregate(model.embed(IMAGES[None]), cameras=object())
     with pytest.raises(UserError, match="reference"):
         model.aggregate(model.embed(IMAGES[None]), reference="best")
+
+
+def test_python_refuses_what_a_model_cannot_do_and_warns_of_what_it_lacks(caplog, monkeypatch):
+    monkeypatch.setattr(pipeline, "_warned_of", [])
+    photos, model = [np.full((32, 32, 3), 40 * k, np.uint8) for k in range(3)], tiny_single_view()
+    with pytest.raises(UserError, match="has no cross-view layers"):
+        freegeo.adapt(model, photos)
+    with pytest.raises(UserError, match="tiny-single-view finds no cameras from rays"):
+        freegeo.reconstruct(model, photos, pose_from="rays")
+    with pytest.raises(UserError, match="cameras come from camera or rays, not 'sky'"):
+        freegeo.reconstruct(model, photos, pose_from="sky")
+    model.spec = replace(model.spec, caution="Depth has an unknown focal length.")
+    for _ in range(2):
+        assert not freegeo.reconstruct(model, photos, device="cpu").has_cameras
+    assert caplog.text.count("Depth has an unknown focal length.") == 1
 
 
 # -- nested

@@ -8,7 +8,7 @@ The keys are field names and must not change, because scripts of users read them
 | `conf` | (S, H, W) | float32 | confidence, higher is better, not calibrated; 1 where the model gives none |
 | `T_cam_world` | (S, 4, 4) | float32 | world to camera, OpenCV axes; absent without cameras |
 | `K` | (S, 3, 3) | float32 | pixels of the H x W map, centres at whole numbers; absent without cameras |
-| `sky` | (S, H, W) | float32 | probability of sky; absent when the model does not give it |
+| `sky` | (S, H, W) | float32 | 0 and more; sky from .3 on; absent when the model does not give it |
 | `images` | (S, H, W, 3) | uint8 | the images the model read |
 | `names` | (S,) | str | names of the photos |
 | `photo_hw` | (S, 2) | int64 | height and width of the photos after EXIF rotation |

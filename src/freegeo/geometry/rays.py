@@ -42,8 +42,11 @@ def cameras_from_rays(
     Raises:
         FreeGeoError: the maps have fewer than eight cells.
     """
-    leading, (height, width) = rays.shape[:-3], rays.shape[-3:-1]
-    # The normal matrix squares the condition number; float64 keeps the precision of a float32 map.
+    leading, (height, width), origin = rays.shape[:-3], rays.shape[-3:-1], rays
+    # The normal matrix squares the condition number; float64, which Apple GPUs lack, keeps the precision of a float32
+    # map.
+    if rays.device.type == "mps":
+        rays, confidence = rays.cpu(), confidence.cpu()
     flat = rays.reshape(-1, height * width, 6).double()
     weights = confidence.reshape(-1, height * width).double()
     grid = _normalised_grid(height, width, like=flat)
@@ -63,7 +66,10 @@ def cameras_from_rays(
         (1 + lower[:, 2, 0]) * half_width,
         (1 + lower[:, 2, 1]) * half_height,
     )
-    return T_cam_world.reshape(*leading, 4, 4).to(rays.dtype), K.reshape(*leading, 3, 3).to(rays.dtype)
+    # The type first: a float64 tensor cannot go to an Apple GPU.
+    found = (T_cam_world.reshape(*leading, 4, 4), K.reshape(*leading, 3, 3))
+    T_cam_world, K = (values.to(origin.dtype).to(origin.device) for values in found)
+    return T_cam_world, K
 
 
 def _normalised_grid(height: int, width: int, *, like: Tensor) -> Tensor:
