@@ -92,6 +92,9 @@ def test_a_metric_model_gives_metres_frozen_and_adapted(freegeo, photo_folder, t
     again = tmp_path / "again"
     assert freegeo("reconstruct", photo_folder, "-o", again, "--adapter", out / "adapter").code == 0
     np.testing.assert_array_equal(Reconstruction.load(again).depth_z, Reconstruction.load(out).depth_z)
+    merged = tmp_path / "merged.safetensors"
+    assert freegeo("adapter", "merge", out / "adapter", "-o", merged).code == 0
+    assert "fits tiny-nested" in freegeo("models", "check", "tiny-nested", merged).out
 
 
 def test_cameras_of_rays_are_a_setting_of_the_folder(freegeo, photo_folder, tiny, tmp_path):
