@@ -108,6 +108,8 @@ def test_cameras_of_rays_are_a_setting_of_the_folder(freegeo, photo_folder, tiny
     assert (frozen.K[:, :2, 2] != (32, 24)).all() and (adapted.K[:, :2, 2] != (32, 24)).all()
     assert not np.array_equal(frozen.T_cam_world, head.T_cam_world)
     assert (summary(by_rays)["pose_from"], summary(by_head)["pose_from"]) == ("rays", "camera")
+    outcome = freegeo("run", photo_folder, "-o", tmp_path / "b", *tiny, "--recipe", "evidence", "--pose-from", "rays")
+    assert outcome.code == 2 and "teaches the camera head, which --pose-from rays does not read" in outcome.sentence()
     outcome = freegeo("run", photo_folder, "-o", by_rays, *tiny, *OPTIONS)
     assert outcome.code == 2
     assert '--pose-from: "rays" there, none now' in outcome.sentence()

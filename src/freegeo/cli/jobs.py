@@ -112,6 +112,10 @@ def run_job(
     plan = None if recipe is None else recipe.build(empty.spec)
     if plan is not None:
         require_enough_photos(photos)
+        if plan.cameras and pose_from == "rays":
+            raise UserError(
+                f"recipe {plan.name} teaches the camera head, which --pose-from rays does not read. Leave one of both out."
+            )
     if empty.spec.caution:
         logger.warning("%s", empty.spec.caution)
     masks = files.checked_masks(photos)
