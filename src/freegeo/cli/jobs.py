@@ -114,7 +114,8 @@ def run_job(
         require_enough_photos(photos)
         if plan.cameras and pose_from == "rays":
             raise UserError(
-                f"recipe {plan.name} teaches the camera head, which --pose-from rays does not read. Leave one of both out."
+                f"recipe {plan.name} teaches the camera head, which --pose-from rays does not read. Leave out one of "
+                "them."
             )
     if empty.spec.caution:
         logger.warning("%s", empty.spec.caution)
