@@ -9,7 +9,7 @@ from freegeo.adaptation.samples import SceneImages
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.da3 import DA3
 from freegeo.models.da3_config import DA3Config
-from freegeo.models.spec import AdaptationDefaults, ModelSpec
+from freegeo.models.spec import AdaptationDefaults, ModelSpec, Takes
 from freegeo.models.vggt import VGGT
 from freegeo.models.vggt_config import VGGTConfig
 
@@ -24,7 +24,7 @@ def tiny_da3(seed: int = 0, ffn: str = "mlp", name: str = "tiny-da3") -> DA3:
         head_features=8, head_channels=(4, 8, 8, 8), patch_size=PATCH, position_grid=4,
         camera_encoder_depth=1, camera_encoder_heads=2,
     )  # fmt: skip
-    return randomise(DA3(config, _spec(name, config.out_layers, special=1)), seed)
+    return randomise(DA3(config, _spec(name, config.out_layers, special=1, takes="cameras")), seed)
 
 
 def tiny_vggt(seed: int = 0, name: str = "tiny-vggt") -> VGGT:
@@ -98,10 +98,10 @@ def trained(model: ReconstructionModel, seed: int = 1) -> Adapter:
     return adapter
 
 
-def _spec(name: str, layers: tuple[int, ...], special: int) -> ModelSpec:
+def _spec(name: str, layers: tuple[int, ...], special: int, takes: Takes = "nothing") -> ModelSpec:
     return ModelSpec(
         name=name, patch_size=PATCH, default_side=4 * PATCH, loss_layers=layers, reference="first",
-        special_tokens=special, weights_licence="none", adaptation=DEFAULTS,
+        special_tokens=special, weights_licence="none", adaptation=DEFAULTS, takes=takes,
     )  # fmt: skip
 
 

@@ -120,6 +120,7 @@ def _published(name: str, config: DA3Config, licence: str, parameters: int, hub_
         special_tokens=1,
         weights_licence=licence,
         adaptation=AdaptationDefaults(temperature=10.0, scene_lr=3e-5, published="da3"),
+        takes="cameras",
     )
     return ModelEntry(
         name=name,
@@ -148,6 +149,7 @@ def embedded_spec(config: DA3Config) -> ModelSpec:
         special_tokens=1,
         weights_licence=APACHE,
         adaptation=AdaptationDefaults(temperature=2.5, scene_lr=1e-3, rank=16, neighbours=True),
+        takes="cameras",
     )
 
 

@@ -19,6 +19,13 @@ Mixed = Literal["crop", "pad", "upstream"]
 MIXED: Mixed = "crop"
 
 
+Takes = Literal["nothing", "cameras"]
+"""What a model can be told of its views.
+
+`cameras`: poses together with intrinsics, of all views or of none.
+"""
+
+
 @dataclass(frozen=True, kw_only=True)
 class AdaptationDefaults:
     """Settings of the method that depend on the model's features, published or measured."""
@@ -50,6 +57,8 @@ class ModelSpec:
     """Tokens of a view that are no patches."""
     weights_licence: str
     adaptation: AdaptationDefaults
+    takes: Takes = "nothing"
+    """What the model can be told of its views (`freegeo.types.Priors`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
