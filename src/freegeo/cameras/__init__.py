@@ -1,1 +1,1 @@
-"""Known cameras: reading, checking, converting."""
+"""Known cameras: reading, checking, undistorting and converting (docs/cameras.md)."""

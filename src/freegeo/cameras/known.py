@@ -30,6 +30,10 @@ class KnownCamera:
     """(3, 3) float64 in pixels of the upright photo, counted from its corner (the first pixel's centre is .5, .5)."""
     lens: Lens | None = None
     """Distortion; None: a pinhole, or not known."""
+    size_hw: tuple[int, int] | None = None
+    """Height and width of the image that `K` counts pixels of; with photos, those of the upright photo."""
+    ids: tuple[int, int] | None = None
+    """COLMAP's numbers of the image and of its camera, kept for writing a COLMAP model again."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,6 +47,8 @@ class KnownCameras:
     """File or folder that they come from."""
     metric: bool = False
     """Whether lengths are metres."""
+    convention: str = "w2c-opencv"
+    """How the matrices of `source` were read; a key of `freegeo.cameras.convention.READINGS`."""
 
     def __len__(self) -> int:
         """Return the number of photos."""

@@ -23,8 +23,11 @@ _MODELS = (  # name and number of parameters, at the position that is COLMAP's n
     ("SIMPLE_RADIAL_FISHEYE", 4),
     ("RADIAL_FISHEYE", 5),
     ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 )
-_TWO_FOCAL_LENGTHS = frozenset({"PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"})
+_TWO_FOCAL_LENGTHS = frozenset(
+    {"PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"}
+)
 _POINT_BYTES = 24
 
 
@@ -59,6 +62,7 @@ class ColmapImage:
     camera: int
     T_cam_world: np.ndarray
     """(4, 4) float64."""
+    number: int
 
 
 def read_cameras(folder: Path) -> dict[int, ColmapCamera]:
@@ -98,20 +102,41 @@ def _text_cameras(path: Path) -> list[ColmapCamera]:
         tokens = line.split()
         if tokens and not line.startswith("#"):
             number, model, width, height, *params = tokens
+            _require_model(model, len(params))
             cameras.append(ColmapCamera(int(number), model, (int(height), int(width)), tuple(map(float, params))))
     return cameras
+
+
+def _require_model(model: str, count: int) -> None:
+    expected = dict(_MODELS).get(model)
+    if expected is None:
+        raise ValueError(f"unknown camera model {model}")
+    if count != expected:
+        raise ValueError(f"a camera of the model {model} has {expected} parameters, not {count}")
 
 
 def _text_images(path: Path) -> list[ColmapImage]:
     lines = path.read_text(encoding="utf-8").splitlines()
     header = next((number for number, line in enumerate(lines) if not line.startswith("#")), len(lines))
     images = []
-    for line in lines[header::2]:  # by position: the points line of an image may be empty
+    # By position: the points line of an image may be empty, and the last one may be missing.
+    for place, line in enumerate(lines[header::2]):
         tokens = line.split(maxsplit=9)
         if tokens:
+            points = lines[header + 2 * place + 1].split() if header + 2 * place + 1 < len(lines) else []
+            if len(points) % 3 or not all(map(_is_number, points[:3])):
+                raise ValueError(f"the line after image {tokens[9]} is not one of its points")
             quat_wxyz, translation = [float(t) for t in tokens[1:5]], [float(t) for t in tokens[5:8]]
-            images.append(ColmapImage(tokens[9], int(tokens[8]), _pose(quat_wxyz, translation)))
+            images.append(ColmapImage(tokens[9], int(tokens[8]), _pose(quat_wxyz, translation), int(tokens[0])))
     return images
+
+
+def _is_number(token: str) -> bool:
+    try:
+        float(token)
+    except ValueError:
+        return False
+    return True
 
 
 def _binary_cameras(path: Path) -> list[ColmapCamera]:
@@ -119,6 +144,8 @@ def _binary_cameras(path: Path) -> list[ColmapCamera]:
         cameras = []
         for _ in range(_read(file, "<Q")[0]):
             number, model_number, width, height = _read(file, "<iiQQ")
+            if not 0 <= model_number < len(_MODELS):
+                raise ValueError(f"camera {number} has the unknown model {model_number}")
             model, count = _MODELS[model_number]
             cameras.append(ColmapCamera(number, model, (height, width), _read(file, f"<{count}d")))
         return cameras
@@ -128,11 +155,11 @@ def _binary_images(path: Path) -> list[ColmapImage]:
     with path.open("rb") as file:
         images = []
         for _ in range(_read(file, "<Q")[0]):
-            _, *pose, camera = _read(file, "<i7di")
+            number, *pose, camera = _read(file, "<i7di")
             name = bytearray()
             while (letter := _read(file, "<c")[0]) != b"\0":
                 name += letter
-            images.append(ColmapImage(name.decode("utf-8"), camera, _pose(pose[:4], pose[4:])))
+            images.append(ColmapImage(name.decode("utf-8"), camera, _pose(pose[:4], pose[4:]), number))
             file.seek(_POINT_BYTES * _read(file, "<Q")[0], 1)
         return images
 
