@@ -664,6 +664,7 @@ class Job:
             "images": list(final.names),
             "photo_files": None if self.photos is None else photo_records(self.photos),
             "image_hw": list(final.image_hw),
+            "scale": None if final.scale is None else asdict(final.scale),
             "adapter": ADAPTER_FOLDER if trained else (str(self.adapter) if self.adapter else None),
             "rejected_adapter": None if trained or self.recipe is None else rejected or (verdict or {}).get("reason"),
             "verdict": verdict,

@@ -251,7 +251,7 @@ class Prediction:
     """A network's output at the network's resolution; what a model does not predict, or was not asked for, is None."""
 
     depth_z: Tensor | None = None
-    """(..., S, H, W), up to scale unless the model is metric."""
+    """(..., S, H, W), up to scale unless there is a `scale`."""
     conf: Tensor | None = None
     """(..., S, H, W), in (1, inf), higher is better, not calibrated."""
     T_cam_world: Tensor | None = None
@@ -264,6 +264,8 @@ class Prediction:
     """(..., S, h, w, 7): direction, origin, confidence."""
     points: Tensor | None = None
     """(..., S, H, W, 4): world point and its confidence."""
+    scale: Tensor | None = None
+    """(...): factor that turned all lengths into metres, applied already; None: they are up to scale."""
 
     def map(self, change) -> Self:
         """Apply `change` to every tensor that is there."""

@@ -17,7 +17,7 @@ from freegeo.export.formats import FORMATS, check_formats, chosen_formats, expor
 from freegeo.export.mesh import fuse, voxel_size, write_mesh
 from freegeo.export.nerfstudio import opengl_camera_to_world
 from freegeo.export.pixels import masks_for_model
-from freegeo.export.reconstruction import Reconstruction
+from freegeo.export.reconstruction import METRIC_MODEL, Reconstruction, Scale
 from freegeo.files import LEDGER_FILE
 from freegeo.fusion.settings import FilterSettings
 from freegeo.geometry.depth import depth_to_world
@@ -220,6 +220,18 @@ def test_nerfstudio_cameras_project_points_to_the_photos(tmp_path):
         assert z < 0, "OpenGL cameras look along -z"
         place = (frame["cx"] - frame["fl_x"] * x / z, frame["cy"] + frame["fl_y"] * y / z)
         np.testing.assert_allclose(place, (column + 0.5, row + 0.5), atol=1e-2)
+
+
+@pytest.mark.parametrize("scale", [None, Scale(value=2.0, source=METRIC_MODEL)])
+def test_files_for_other_tools_say_the_unit(tmp_path, scale):
+    scene = replace(room(), scale=scale)
+    scene.export(tmp_path, ["ply", "glb", "mesh", "colmap", "depth"], max_tracks=20, voxel=0.2)
+    said = "lengths are metres (from a metric model)" if scale else "lengths are up to scale"
+    for name in ("points.ply", "mesh.ply"):
+        assert f"\ncomment {said}\n".encode() in (tmp_path / name).read_bytes().split(b"end_header")[0]
+    assert said in (tmp_path / "colmap" / "README.txt").read_text().lower()
+    assert trimesh.load(tmp_path / "scene.glb").metadata["lengths"] == scene.lengths
+    assert json.loads((tmp_path / "depth" / "depth.json").read_text())["lengths"] == scene.lengths
 
 
 def test_opengl_axes_turn_the_camera_and_leave_its_place():

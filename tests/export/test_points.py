@@ -12,7 +12,7 @@ from freegeo.fusion.points import PointCloud
 
 
 def write_scene(scene, cloud, path):
-    return write_glb(cloud, scene.T_cam_world, scene.K, scene.image_hw, path)
+    return write_glb(cloud, scene.T_cam_world, scene.K, scene.image_hw, path, lengths=scene.lengths)
 
 
 def test_points_project_back_to_their_pixels_and_carry_their_colours():
@@ -64,7 +64,7 @@ def test_thinning_is_seeded_and_keeps_the_order():
 
 def test_ply_reopens_with_the_same_points_and_colours(tmp_path):
     cloud = cloud_of(room())
-    loaded = trimesh.load(write_ply(cloud, tmp_path / "deep" / "points.ply"))
+    loaded = trimesh.load(write_ply(cloud, tmp_path / "deep" / "points.ply", lengths="up to scale"))
     np.testing.assert_array_equal(loaded.vertices.astype(np.float32), cloud.points)
     np.testing.assert_array_equal(loaded.colors[:, :3], cloud.colours)
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["points.ply"]
@@ -113,7 +113,7 @@ def test_a_point_in_front_of_the_first_camera_is_at_minus_z_and_up_is_plus_y(tmp
         pixel=np.zeros((2, 2), np.int64),
     )
     K = np.array([[[50, 0, 32], [0, 50, 24], [0, 0, 1]]], np.float32)
-    file = write_glb(cloud, np.eye(4, dtype=np.float32)[None], K, (48, 64), tmp_path / "a.glb")
+    file = write_glb(cloud, np.eye(4, dtype=np.float32)[None], K, (48, 64), tmp_path / "a.glb", lengths="up to scale")
     loaded = trimesh.load(file)
     np.testing.assert_array_equal(loaded.geometry["points"].vertices, [[0, 0, -2], [0, 1, -2]])
     assert loaded.geometry["camera_000"].vertices[:, 2].min() < -0.1
@@ -136,7 +136,7 @@ def test_nothing_is_written_without_points(tmp_path):
     scene = room()
     empty = cloud_of(scene).select(np.zeros(0, np.int64))
     with pytest.raises(FreeGeoError, match="no point is left"):
-        write_ply(empty, tmp_path / "points.ply")
+        write_ply(empty, tmp_path / "points.ply", lengths="up to scale")
     with pytest.raises(FreeGeoError, match="no point is left"):
         write_scene(scene, empty, tmp_path / "scene.glb")
     assert list(tmp_path.iterdir()) == []

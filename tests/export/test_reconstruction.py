@@ -6,7 +6,7 @@ import torch
 
 from exact_rooms import room
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.export.reconstruction import Reconstruction
+from freegeo.export.reconstruction import METRIC_MODEL, Reconstruction, Scale
 from freegeo.types import ImageBatch, Prediction
 
 
@@ -74,6 +74,26 @@ def test_a_model_without_cameras_is_stored_and_says_so(tmp_path):
     np.testing.assert_array_equal(loaded.conf, np.ones_like(loaded.depth_z))
     with pytest.raises(UserError, match="no cameras"):
         loaded.photo_K()
+
+
+def test_a_metric_prediction_stays_metric_in_the_file(tmp_path):
+    prediction = replace(prediction_of(), scale=torch.tensor([2.5]))
+    stored = Reconstruction.from_prediction(prediction, batch_of())
+    assert stored.scale == Scale(value=2.5, source=METRIC_MODEL)
+    assert repr(stored).endswith(" cameras, metres)")
+    for scale in (stored.scale, Scale(value=1e-3, source="known distances", spread=0.02), None):
+        replace(stored, scale=scale).save(tmp_path)
+        assert Reconstruction.load(tmp_path).scale == scale
+    assert Reconstruction.load(tmp_path).lengths == "up to scale"
+
+
+@pytest.mark.parametrize("wrong", [{"value": 0.0}, {"value": np.nan}, {"value": 1.0, "spread": -1.0}])
+def test_a_scale_that_is_none_is_refused(tmp_path, wrong):
+    with pytest.raises(FreeGeoError, match="scale"):
+        Scale(source="known distances", **wrong)
+    np.savez(tmp_path / "prediction.npz", **room().arrays(), **{f"scale_{k}": v for k, v in wrong.items()})
+    with pytest.raises(FreeGeoError, match="not a reconstruction"):
+        Reconstruction.load(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from exact_rooms import room
 from example_results import HOSTILE_NAME, write_example
 from freegeo import files
 from freegeo.export.kept import save_kept
+from freegeo.export.reconstruction import METRIC_MODEL, Scale
 from freegeo.fusion.filtering import FilterReport
 from freegeo.report import figures, scene3d
 from freegeo.report.page import flattened, score_table, write_report
@@ -75,6 +76,12 @@ def test_the_svg_takes_the_colours_of_the_page(example):
         assert "var(--adapted)" in drawing
         assert not re.search(r"#0[0-9a-f]0[0-9a-f]0[0-9a-f]", drawing)
         assert "width=" not in drawing.split(">", 1)[0]
+
+
+def test_the_page_says_the_unit(tmp_path):
+    for scale, text in ((None, "up to scale"), (Scale(value=3.0, source=METRIC_MODEL), "metres (from a metric model)")):
+        dataclasses.replace(room(2), scale=scale).save(tmp_path)
+        assert f"<dt>lengths</dt><dd>{text}</dd>" in write_report(tmp_path).read_text(encoding="utf-8")
 
 
 def test_a_frozen_run_without_cameras_has_a_page(tmp_path):

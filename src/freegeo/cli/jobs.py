@@ -180,6 +180,8 @@ def describe(summary: dict[str, Any], folder: Path) -> None:
     """Print the outcome of a job."""
     say_answer(summary)
     console.say(f"{len(summary['images'])} views at {summary['image_hw'][1]} x {summary['image_hw'][0]} pixels")
+    if summary["scale"]:
+        console.say(f"lengths are metres (from {summary['scale']['source']})")
     if summary["loss"]:
         first, last = summary["loss"]["first"], summary["loss"]["last"]
         console.say(f"adaptation loss {first:.4f} -> {last:.4f} (means of the first and last tenth of the steps)")

@@ -40,6 +40,8 @@ images     upright copies of the photos
 Use the model with images/ (--image_path), not with the original photos: COLMAP and the trainers of Gaussian splats do
 not turn photos by their EXIF orientation, but these cameras are those of upright photos.
 
+Lengths are {lengths}.
+
 """
 PROJECTED = """Observations are re-projections of the prediction.
 They are not measured in the photos, but are the predicted points, projected into the views that agree on them.
@@ -146,7 +148,7 @@ def _write(export: Export) -> list[Path]:
     copies = export.write_photos(root / photos.FOLDER)
     notice = root / "README.txt"
     with files.atomic_path(notice) as part:
-        part.write_text(NOTICE + kind, encoding="utf-8")
+        part.write_text(NOTICE.format(lengths=r.lengths) + kind, encoding="utf-8")
     logger.info(
         "colmap: the model is about the upright photos in %s/%s, not the original ones. Its %s", FOLDER.parts[0],
         photos.FOLDER,

@@ -43,7 +43,10 @@ def write_depth(reconstruction: Reconstruction, folder: Path, *, keep: np.ndarra
     for path, view in zip(paths, values, strict=True):
         with files.atomic_path(path) as part:
             Image.fromarray(view).save(part, pnginfo=text, compress_level=1)
-    files.write_json(folder / "depth.json", {"scale": scale, "meaning": MEANING, "maps": maps})
+    files.write_json(
+        folder / "depth.json",
+        {"scale": scale, "lengths": reconstruction.lengths, "meaning": MEANING, "maps": maps},
+    )
     return [*paths, folder / "depth.json"]
 
 

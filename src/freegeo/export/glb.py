@@ -35,10 +35,18 @@ def opencv_to_gltf(vectors: np.ndarray) -> np.ndarray:
     return vectors * np.asarray((1, -1, -1), dtype=vectors.dtype)
 
 
-def write_glb(cloud: PointCloud, T_cam_world: np.ndarray, K: np.ndarray, image_hw: tuple[int, int], path: Path) -> Path:
+def write_glb(
+    cloud: PointCloud,
+    T_cam_world: np.ndarray,
+    K: np.ndarray,
+    image_hw: tuple[int, int],
+    path: Path,
+    *,
+    lengths: str,
+) -> Path:
     """Write points and camera frusta.
 
-    The scene's objects are named `points` and `camera_000`, `camera_001`, ... in view order.
+    The scene's objects are named `points` and `camera_000`, `camera_001`, ... in view order; its extras say the unit.
 
     Args:
         cloud: world points.
@@ -46,6 +54,7 @@ def write_glb(cloud: PointCloud, T_cam_world: np.ndarray, K: np.ndarray, image_h
         K: (S, 3, 3) pixels of images of the size `image_hw`.
         image_hw: height and width.
         path: of the file.
+        lengths: that of the reconstruction.
 
     Raises:
         FreeGeoError: there is no point.
@@ -53,7 +62,7 @@ def write_glb(cloud: PointCloud, T_cam_world: np.ndarray, K: np.ndarray, image_h
     import trimesh
 
     require_points(cloud, path)
-    scene = trimesh.Scene()
+    scene = trimesh.Scene(metadata={"lengths": lengths})
     points = trimesh.PointCloud(opencv_to_gltf(cloud.points), colors=cloud.colours)
     scene.add_geometry(points, geom_name="points", node_name="points")
     size = FRUSTUM_SHARE * _typical_depth(cloud, T_cam_world)
@@ -113,8 +122,8 @@ def _beams(corners: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _write(export: Export) -> list[Path]:
-    T_cam_world, K = export.reconstruction.cameras()
-    return [write_glb(export.cloud, T_cam_world, K, export.reconstruction.image_hw, export.folder / FILE_NAME)]
+    r = export.reconstruction
+    return [write_glb(export.cloud, *r.cameras(), r.image_hw, export.folder / FILE_NAME, lengths=r.lengths)]
 
 
 FORMAT = Format(name="glb", path=FILE_NAME, about="points and camera frusta", write=_write)

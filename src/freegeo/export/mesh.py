@@ -11,6 +11,7 @@ import numpy as np
 from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.base import Export, Format
+from freegeo.export.ply import ply_bytes
 from freegeo.export.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
@@ -104,7 +105,8 @@ def write_mesh(reconstruction: Reconstruction, keep: np.ndarray, path: Path, *, 
         raise FreeGeoError(f"{path}: no surface with voxels of {voxel:.4g}. Choose larger voxels or fewer filters.")
     colours = vertex_colours(mesh, reconstruction, keep, tolerance=TRUNCATION_VOXELS * voxel)
     with files.atomic_path(path) as part:
-        trimesh.Trimesh(mesh.vertices, mesh.triangles, vertex_colors=colours, process=False).export(part)
+        surface = trimesh.Trimesh(mesh.vertices, mesh.triangles, vertex_colors=colours, process=False)
+        part.write_bytes(ply_bytes(surface, reconstruction.lengths))
     return path
 
 

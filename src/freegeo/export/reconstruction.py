@@ -4,7 +4,7 @@ The keys are field names and must not change, because scripts of users read them
 
 | key | shape | type | meaning |
 |---|---|---|---|
-| `depth_z` | (S, H, W) | float32 | coordinate along the optical axis, up to scale unless the model is metric |
+| `depth_z` | (S, H, W) | float32 | coordinate along the optical axis; metres with a scale, else up to scale |
 | `conf` | (S, H, W) | float32 | confidence, higher is better, not calibrated; 1 where the model gives none |
 | `T_cam_world` | (S, 4, 4) | float32 | world to camera, OpenCV axes; absent without cameras |
 | `K` | (S, 3, 3) | float32 | pixels of the H x W map, centres at whole numbers; absent without cameras |
@@ -13,14 +13,17 @@ The keys are field names and must not change, because scripts of users read them
 | `names` | (S,) | str | names of the photos |
 | `photo_hw` | (S, 2) | int64 | height and width of the photos after EXIF rotation |
 | `scale_xy`, `offset_xy` | (S, 2) | float64 | model pixel = photo pixel * scale + offset, x first |
+| `scale_value`, `scale_spread` | () | float64 | the fields of `Scale`; absent where lengths are up to scale |
+| `scale_source` | () | str | its third field |
 | `format` | () | int64 | version of this table |
 """
 
 from __future__ import annotations
 
+import math
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,8 +42,42 @@ if TYPE_CHECKING:
 
 FILE_NAME = "prediction.npz"
 VERSION = 1
+METRIC_MODEL = "a metric model"
 _OPTIONAL = ("T_cam_world", "K", "sky")
 _DTYPES = {"images": np.uint8, "photo_hw": np.int64, "scale_xy": np.float64, "offset_xy": np.float64}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """What a reconstruction's lengths being metres rests on; FreeGeoError for a value or spread that is no number."""
+
+    value: float
+    """Factor that turned the prediction's lengths into metres; it is applied already."""
+    source: str
+    """What it comes from, as it reads after "from", such as `METRIC_MODEL`."""
+    spread: float | None = None
+    """Relative spread (one standard deviation) of the factors that single measurements give; None: not known."""
+
+    def __post_init__(self) -> None:
+        """Raise FreeGeoError for values that no measurement gives."""
+        if not (math.isfinite(self.value) and self.value > 0):
+            raise FreeGeoError(f"the scale of a reconstruction must be positive, got {self.value}.")
+        if self.spread is not None and not (math.isfinite(self.spread) and self.spread >= 0):
+            raise FreeGeoError(f"the spread of a reconstruction's scale must not be negative, got {self.spread}.")
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the entries of the file."""
+        found = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {f"scale_{name}": np.asarray(value) for name, value in found.items() if value is not None}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Scale | None:
+        """Read what `arrays` returned; None where there is no scale."""
+        if "scale_value" not in arrays:
+            return None
+        spread = arrays.get("scale_spread")
+        source = str(arrays.get("scale_source", "an unknown source"))
+        return cls(value=float(arrays["scale_value"]), source=source, spread=None if spread is None else float(spread))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +103,8 @@ class Reconstruction:
     """(S, 3, 3) float32."""
     sky: np.ndarray | None = None
     """(S, H, W) float32."""
+    scale: Scale | None = None
+    """What the lengths being metres rests on; None: they are up to scale."""
 
     def __post_init__(self) -> None:
         """Raise FreeGeoError when a shape does not fit the others."""
@@ -94,7 +133,13 @@ class Reconstruction:
     def __repr__(self) -> str:
         """Return the size of the result, not its arrays."""
         cameras = "cameras" if self.has_cameras else "no cameras"
-        return f"Reconstruction({len(self)} views, {self.image_hw[1]} x {self.image_hw[0]} pixels, {cameras})"
+        unit = "" if self.scale is None else ", metres"
+        return f"Reconstruction({len(self)} views, {self.image_hw[1]} x {self.image_hw[0]} pixels, {cameras}{unit})"
+
+    @property
+    def lengths(self) -> str:
+        """Unit of all lengths, and what it rests on, as it reads after "lengths are"."""
+        return "up to scale" if self.scale is None else f"metres (from {self.scale.source})"
 
     @property
     def image_hw(self) -> tuple[int, int]:
@@ -162,6 +207,7 @@ class Reconstruction:
             T_cam_world=_to_numpy(prediction.T_cam_world, trailing=3),
             K=_to_numpy(prediction.K, trailing=3),
             sky=_to_numpy(prediction.sky, trailing=3),
+            scale=None if prediction.scale is None else Scale(value=float(prediction.scale), source=METRIC_MODEL),
             images=np.ascontiguousarray(images.cpu().numpy()),
             names=tuple(batch.names),
             photo_hw=batch.photo_hw.cpu().numpy().astype(np.int64),
@@ -171,9 +217,10 @@ class Reconstruction:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the content of the file: every field that is not None, under its name, and the format."""
-        present = {f.name: getattr(self, f.name) for f in fields(self)}
+        present = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "scale"}
         arrays = {name: np.asarray(value) for name, value in present.items() if value is not None}
-        return {**arrays, "format": np.array(VERSION, np.int64)}
+        scale = {} if self.scale is None else self.scale.arrays()
+        return {**arrays, **scale, "format": np.array(VERSION, np.int64)}
 
     def save(self, path: Path | str) -> Path:
         """Write the file (`prediction.npz` of `path` when that is a folder) atomically; returns where it is."""
@@ -250,13 +297,13 @@ class Reconstruction:
         version = int(arrays.get("format", VERSION))
         if version > VERSION:
             raise UserError(f"{file}: written by a newer freegeo (format {version}). Update freegeo.")
-        names = [f.name for f in fields(cls)]
+        names = [f.name for f in fields(cls) if f.name != "scale"]
         missing = [name for name in names if name not in arrays and name not in _OPTIONAL]
         if missing:
             raise FreeGeoError(f"{file}: not a reconstruction, {', '.join(missing)} missing. Name another file.")
         values = {n: arrays[n].astype(_DTYPES.get(n, np.float32)) for n in names if n in arrays and n != "names"}
         try:
-            return cls(**values, names=tuple(str(name) for name in arrays["names"]))
+            return cls(**values, names=tuple(map(str, arrays["names"])), scale=Scale.from_arrays(arrays))
         except (FreeGeoError, ValueError) as error:
             raise FreeGeoError(f"{file}: not a reconstruction ({error}) Name another file.") from None
 

@@ -121,6 +121,7 @@ def facts(result: Result) -> list[tuple[str, str]]:
         ("model", str(summary.get("model", "unknown"))),
         ("views", str(len(result.names))),
         ("resolution", f"{width} × {height}"),
+        ("lengths", result.lengths),
         ("kept pixels", f"{_percent(final.keep.mean())} of {final.keep.size:,}"),
     ]
     if summary.get("loss"):

@@ -80,6 +80,8 @@ class Result:
     names: Sequence[str]
     images: np.ndarray
     """(S, H, W, 3) uint8, what the model read."""
+    lengths: str
+    """Unit of the folder's files, as it reads after "lengths are"."""
     from_own_frame: Sim3 | None
     """From the world frame of the folder's files to the common one; None without cameras."""
 
@@ -141,6 +143,7 @@ def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
         stages=stages,
         names=final.names,
         images=final.images,
+        lengths=final.lengths,
         from_own_frame=align(final, reference) if final.has_cameras and reference.has_cameras else None,
     )
 
