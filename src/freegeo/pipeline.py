@@ -44,12 +44,13 @@ from freegeo.files import FORMAT, as_json, read_json, remove_written, write_json
 from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
 from freegeo.guarded import Evidence, harm, judge_adapter
+from freegeo.metres import ScaleSource, in_metres, read_scale
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import EMBEDDED_MODEL, warn_of_embedded_model
 from freegeo.models.images import read_photos
 from freegeo.models.precision import Compute
 from freegeo.models.spec import MIXED, Mixed, ModelSpec
-from freegeo.posed import check_known, known_cameras, told, with_known_cameras
+from freegeo.posed import check_known, is_one_camera, known_cameras, told, with_known_cameras, with_one_camera
 from freegeo.progress import step_bar
 from freegeo.refined import refine_by_photos
 from freegeo.report.page import write_report
@@ -60,6 +61,7 @@ from freegeo.types import ImageBatch, PhotoLike, Priors
 if TYPE_CHECKING:
     from freegeo.cameras.known import KnownCameras
     from freegeo.data.photos import PhotoSource
+    from freegeo.fusion.tracks import Tracks
 
 logger = logging.getLogger(__name__)
 
@@ -157,6 +159,8 @@ def reconstruct(
     adapter: Adapter | str | Path | None = None,
     cameras: KnownCameras | str | Path | None = None,
     trust_cameras: bool = False,
+    one_camera: bool | None = None,
+    scale: str | None = None,
     reference: str | None = None,
     device: str | None = None,
     precision: str | None = None,
@@ -173,6 +177,9 @@ def reconstruct(
         cameras: known cameras of the photos, wholly or in part: what `freegeo.read_cameras` returned, or a file that it
             reads. The model is told them where it can take them, and the result has them as they were given.
         trust_cameras: use poses without checking them by the matches between the photos.
+        one_camera: photos of one camera (same size, same EXIF data) share one focal length; None: frames of a video do.
+        scale: where metres come from: `gps`, a measured distance such as "IMG_1.jpg:812,410 IMG_2.jpg:655,398 = 1.25",
+            or a text file of these.
         reference: rule of the reference view; None: the model's own, with and without an adapter.
         device: cpu, cuda, cuda:N or mps; None: the best available.
         precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
@@ -187,22 +194,29 @@ def reconstruct(
     _require_model(model)
     _warn_of_embedded_model(model)
     compute = Compute.choose(device, precision)
-    found, known, _ = _with_cameras(load_photos(photos, max_views), cameras, trust=trust_cameras)
+    found, known = _with_cameras(load_photos(photos, max_views), cameras, trust=trust_cameras)
+    source = None if scale is None else read_scale(scale, found)
     batch = read_photos(model, found, mixed=mixed)
     priors = _told(known, batch, model.spec)
     with _applied(model, adapter):
         result = predict(model, batch, reference=reference, priors=priors, compute=compute)
-    return result if known is None else with_known_cameras(result, known).result
+    if known is not None:
+        result = with_known_cameras(result, known).result
+    if is_one_camera(found) if one_camera is None else one_camera:
+        result, _ = with_one_camera(result, found, known)
+    return result if source is None else in_metres(result, source, found)
 
 
 def _with_cameras(
     photos: Sequence[PhotoLike], cameras: KnownCameras | str | Path | None, *, trust: bool
-) -> tuple[Sequence[PhotoLike], KnownCameras | None, Matches | None]:
-    """Return the photos, undistorted, with their cameras, and the matches these were checked by, if any."""
+) -> tuple[Sequence[PhotoLike], KnownCameras | None]:
+    """Return the photos, undistorted, with their cameras, which are checked unless they are trusted."""
     if cameras is None:
-        return photos, None, None
+        return photos, None
     photos, known = known_cameras(photos, cameras)
-    return photos, known, None if trust else check_known(known, photos)
+    if not trust:
+        check_known(known, photos)
+    return photos, known
 
 
 def _told(known: KnownCameras | None, batch: ImageBatch, spec: ModelSpec) -> Priors | None:
@@ -325,7 +339,7 @@ def adapt(
         pycolmap_module()
     found = load_photos(photos, max_views)
     require_enough_photos(found)
-    found, known, _ = _with_cameras(found, cameras, trust=trust_cameras)
+    found, known = _with_cameras(found, cameras, trust=trust_cameras)
     batch = read_photos(model, found, mixed=mixed)
     priors = _told(known, batch, model.spec)
     images = [scene_images("photos", found, model, plan, batch, priors)]
@@ -536,6 +550,10 @@ class Job:
     """Known cameras of the photos, which the result has as they were given."""
     priors: Priors | None = None
     """What the model is told of them (`freegeo.posed.told`)."""
+    one_camera: bool = False
+    """Whether photos of one camera share one focal length."""
+    scale: ScaleSource | None = None
+    """Where metres come from; None: from known cameras or a metric model, if at all."""
     refine: bool = False
     """Whether the cameras are brought to the matches between the photos by bundle adjustment."""
     seed: int = SEED
@@ -698,23 +716,41 @@ class Job:
         """Make the result of a prediction, and see that it is in the folder; returns facts for reconstruction.json."""
         path, kept, before = self.folder.path, self.folder / PREDICTED_FOLDER, self.folder / UNREFINED_FOLDER
         placed, about = self._placed(predicted)
-        if predicted is not frozen and placed is not predicted and not (kept / PREDICTION_NAME).is_file():
+        changed = placed is not predicted or self.scale is not None
+        if changed and predicted is not frozen and not (kept / PREDICTION_NAME).is_file():
             predicted.save(kept)
         if self.refine and self._is_refined(placed, frozen, is_frozen=predicted is frozen):
             return Reconstruction.load(path), about
-        if placed is not predicted or predicted is frozen or self._predicted_folder != path:
-            placed.save(path)
+        result, _ = self._in_metres(placed)
+        if changed or predicted is frozen or self._predicted_folder != path:
+            result.save(path)
         remove_written(before)
-        if placed is predicted:
+        if not changed:
             remove_written(kept)
-        return placed, about
+        return result, about
 
     def _placed(self, predicted: Reconstruction) -> tuple[Reconstruction, dict[str, Any]]:
-        """Give a prediction the cameras that are known; it comes back as it is where there is nothing to do."""
-        if self.known is None:
-            return predicted, {"known_cameras": None}
-        posed = with_known_cameras(predicted, self.known)
-        return posed.result, {"known_cameras": {**posed.about, "told_to_model": self.priors is not None}}
+        """Give a prediction known and shared cameras; it comes back as it is where there is nothing to do."""
+        about: dict[str, Any] = {"known_cameras": None, "one_camera": None}
+        if self.known is not None:
+            posed = with_known_cameras(predicted, self.known)
+            predicted = posed.result
+            about["known_cameras"] = {**posed.about, "told_to_model": self.priors is not None}
+        if self.one_camera:
+            assert self.photos is not None
+            predicted, about["one_camera"] = with_one_camera(predicted, self.photos, self.known)
+        return predicted, about
+
+    def _in_metres(self, result: Reconstruction, tracks: Tracks | None = None) -> tuple[Reconstruction, Tracks | None]:
+        """Bring a result, and points measured in it, to metres where that is asked for."""
+        if self.scale is None:
+            return result, tracks
+        assert self.photos is not None
+        metric = in_metres(result, self.scale, self.photos)
+        if tracks is not None and metric is not result:
+            assert metric.scale is not None
+            tracks = replace(tracks, xyz=tracks.xyz * metric.scale.value)
+        return metric, tracks
 
     def _is_refined(self, placed: Reconstruction, frozen: Reconstruction | None, *, is_frozen: bool) -> bool:
         """Refine a prediction, unless that is done, and write what comes of it where it is accepted."""
@@ -729,8 +765,10 @@ class Job:
                 if found.tracks is not None:
                     if placed is not frozen:
                         placed.save(before)
-                    save_tracks(path, found.tracks)
-                    found.result.save(path)
+                    result, tracks = self._in_metres(found.result, found.tracks)
+                    assert tracks is not None
+                    save_tracks(path, tracks)
+                    result.save(path)
                 self.folder.note("refinement", {**self._noted("refinement"), **found.about})
             logger.info("%s: %s", "refined" if found.tracks is not None else "not refined", found.about["reason"])
         return self._noted("refinement")["accepted"]

@@ -16,9 +16,12 @@ from freegeo.cameras.convention import check_convention, pairs_to_check
 from freegeo.cameras.known import KnownCameras
 from freegeo.cameras.reading import read_cameras
 from freegeo.cameras.undistortion import UndistortedPhoto, undistorted
+from freegeo.data.image_files import UnreadableImageError, opened
 from freegeo.data.photos import some_of
+from freegeo.data.video import VideoFrame
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.evidence.matches import Matches, find_matches
+from freegeo.evidence.matches import ALL_PAIRS_UP_TO, find_matches, stored_matches
+from freegeo.export.photos import own_file
 from freegeo.export.pixels import HALF
 from freegeo.export.reconstruction import Reconstruction, Scale
 from freegeo.geometry.rotation import mean_rotation, rotation_angle
@@ -41,6 +44,7 @@ SHORT_PAIR = 0.05
 DOUBTFUL_DEG, DOUBTFUL_SHARE, DOUBTFUL_SPREAD, DOUBTFUL_FOCAL = 10.0, 0.2, 0.3, 0.05
 """From here on a difference between predicted and known cameras is a warning: median angle, median distance as a share
 of the longest one between known cameras, spread of the pairs' scale, and relative difference of focal lengths."""
+_EXIF, _CAMERA_TAGS, _FOCAL_TAGS = 0x8769, (0x010F, 0x0110), (0x920A, 0xA405)
 NORMAL = 1.4826
 """Standard deviation of a normal distribution in its median absolute deviations."""
 
@@ -78,18 +82,23 @@ def require_near(known: KnownCameras) -> None:
         )
 
 
-def check_known(known: KnownCameras, photos: Sequence[PhotoLike]) -> Matches | None:
-    """Check known poses by matches between the photos, which are returned; None without two poses to check.
+def check_known(known: KnownCameras, photos: Sequence[PhotoLike], store: Path | None = None) -> None:
+    """Check known poses by matches between the photos: UserError where they do not fit, a warning without evidence.
 
-    UserError for cameras that do not fit; a warning where there is too little to check them by.
+    `store` is the file for the matches of a scene, which is read where it is there, and written when they fit.
     """
     if known.has_pose.sum() < 2:
-        return None
-    matches = find_matches(photos, pairs_to_check(len(photos)))
+        return
+    pairs = pairs_to_check(len(photos))
+    # Of more photos other pairs are matched later, by what the prediction says that they see of each other.
+    store = store if len(photos) <= ALL_PAIRS_UP_TO else None
+    is_there = store is not None and store.is_file()
+    matches = stored_matches(store, photos, pairs) if store is not None and is_there else find_matches(photos, pairs)
     found = check_convention(known, matches)
     found.require()
     logger.info("%s", found.sentence)
-    return matches
+    if store is not None and not is_there:
+        matches.save(store)
 
 
 def digest(known: KnownCameras) -> str:
@@ -282,6 +291,66 @@ def _doubt_focal(focal: float, known: KnownCameras) -> None:
             "stays as predicted, so that shapes may be stretched along the view.",
             known.source, focal,
         )  # fmt: skip
+
+
+def with_one_camera(
+    prediction: Reconstruction, photos: Sequence[PhotoLike], known: KnownCameras | None = None
+) -> tuple[Reconstruction, dict[str, Any]]:
+    """Give photos of one camera one focal length: the median of those that the model predicts for them.
+
+    Photos are of one camera when they have the same size and, where there are EXIF data, the same camera and focal
+    length in these. Intrinsics that are known stay as they are, and depth stays.
+
+    Returns:
+        The reconstruction, and JSON-like facts: `cameras`, one entry for each with more than one photo (`photos`,
+        `focal_px` in pixels of the photos, `spread`: relative, one standard deviation).
+    """
+    if not prediction.has_cameras:
+        return prediction, {"cameras": []}
+    K = prediction.cameras()[1].copy()
+    groups: dict[tuple, list[int]] = {}
+    for view, photo in enumerate(photos):
+        if known is None or known.cameras[view].K is None:
+            groups.setdefault((photo.size_hw, _exif_camera(photo)), []).append(view)
+    shared = []
+    for (size_hw, _), views in groups.items():
+        if len(views) < 2:
+            continue
+        scale = prediction.scale_xy[views]
+        focal = np.stack((K[views, 0, 0], K[views, 1, 1]), axis=1) / scale
+        median, spread = np.median(focal, axis=0), float(np.log(focal).std(axis=0).mean())
+        K[views, 0, 0], K[views, 1, 1] = (median * scale).T
+        shared.append({"photos": len(views), "focal_px": float(np.sqrt(median.prod())), "spread": spread})
+        logger.info(
+            "one camera: %d photos of %d x %d share a focal length of %.1f px; the model's differ by %.1f %%",
+            len(views), size_hw[1], size_hw[0], shared[-1]["focal_px"], 100 * spread,
+        )  # fmt: skip
+        if spread > DOUBTFUL_FOCAL:
+            logger.warning(
+                "one camera: the focal lengths that the model sees in %d photos differ by %.0f %%; if they were taken "
+                "with a zoom or several cameras, give --no-one-camera.",
+                len(views), 100 * spread,
+            )  # fmt: skip
+    return replace(prediction, K=K), {"cameras": shared}
+
+
+def is_one_camera(photos: Sequence[PhotoLike]) -> bool:
+    """Whether photos are taken for those of one camera when nobody says so: frames of a video are."""
+    return all(isinstance(photo, VideoFrame) for photo in photos)
+
+
+def _exif_camera(photo: PhotoLike) -> tuple[str, ...] | None:
+    """Maker, model and focal lengths in a photo's EXIF data; None where there are none."""
+    file = own_file(photo)
+    if file is None:
+        return None
+    try:
+        with opened(file) as image:
+            exif = image.getexif()
+            values = [*(exif.get(tag) for tag in _CAMERA_TAGS), *(exif.get_ifd(_EXIF).get(tag) for tag in _FOCAL_TAGS)]
+    except (UnreadableImageError, OSError, SyntaxError, ValueError, TypeError, LookupError):
+        return None
+    return tuple(map(str, values)) if any(value is not None for value in values) else None
 
 
 def undistorted_masks(masks: list[np.ndarray] | None, photos: Sequence[PhotoLike]) -> list[np.ndarray] | None:

@@ -24,7 +24,7 @@ import math
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -184,6 +184,24 @@ class Reconstruction:
 
         mapping = (self.photo_hw, self.scale_xy, self.offset_xy)
         return inside_photo(*map(torch.from_numpy, mapping), self.image_hw).numpy()
+
+    def scaled(self, factor: float, *, source: str, spread: float | None = None) -> Reconstruction:
+        """Return the reconstruction in metres: depth and camera positions times a factor, together.
+
+        Args:
+            factor: metres in a unit of its present lengths.
+            source: what that comes from, as it reads after "from".
+            spread: relative error of the factor; None: not known.
+
+        Raises:
+            FreeGeoError: a factor that is not positive.
+        """
+        scale = Scale(value=factor, source=source, spread=spread)
+        T = self.T_cam_world
+        if T is not None:
+            T = T.copy()
+            T[:, :3, 3] *= factor
+        return replace(self, depth_z=(self.depth_z * factor).astype(np.float32), T_cam_world=T, scale=scale)
 
     @classmethod
     def from_prediction(cls, prediction: Prediction, batch: ImageBatch) -> Reconstruction:
