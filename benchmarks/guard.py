@@ -36,7 +36,10 @@ from freegeo.evidence.guard import (
     judge,
 )  # fmt: skip
 from freegeo.evidence.matches import find_matches
+from freegeo.evidence.refinement import bring_depth, refine
 from freegeo.evidence.scores import PairScores, two_view
+from freegeo.export.reconstruction import Reconstruction
+from freegeo.metrics.bootstrap import paired_interval
 from freegeo.metrics.scene import evaluate
 from freegeo.models.catalog import load_model
 from freegeo.models.precision import Compute
@@ -82,6 +85,8 @@ def record(folder: Path, domain: str, room: int, *, hold: float, seed: int) -> N
     arrays: dict[str, np.ndarray] = {"pairs": matches.pairs, "counts": matches.counts, "flatness": matches.flatness}
     arrays["loss"] = np.array([step["total"] for step in made.curve])
     reference = None
+    judged: dict[tuple[float, float], Reconstruction] = {}
+    measured: dict[tuple[float, float], Measurement] = {}
     for share, strength in CANDIDATES:
         made.adapter.load(states[share])
         made.adapter.set_strength(strength)
@@ -93,15 +98,23 @@ def record(folder: Path, domain: str, room: int, *, hold: float, seed: int) -> N
             if name == JUDGED:
                 candidate = Candidate.of(found[0])
                 reference = reference or Reference.of(candidate, matches)
-                arrays |= {f"{key}/{score}": value for score, value in scored(candidate, reference).items()}
+                judged[share, strength], measured[share, strength] = found[0], reference.measure(candidate)
+                scores = scored(candidate, reference, measured[share, strength])
+                arrays |= {f"{key}/{score}": value for score, value in scores.items()}
+    chosen = chosen_state(measured, GuardSettings())
+    for name, state in (("frozen", FROZEN), ("guarded", chosen)):
+        refinement = refine(judged[state], matches)
+        result = bring_depth(judged[state], refinement)[0] if refinement.accepted else judged[state]
+        row = evaluate(result, scene.select(ADAPTED_TO))
+        arrays[f"refined-{name}"] = np.array([row[m] for m in METRICS])
+        arrays[f"refined-{name}/accepted"] = np.array(refinement.accepted)
     arrays["seconds"] = np.array([adapted_at - started, time.monotonic() - started])
     files.write_npz(file, arrays)
     print(file.name, f"{arrays['seconds'][1]:.0f} s, {len(matches.pairs)} pairs", flush=True)
 
 
-def scored(candidate: Candidate, reference: Reference) -> dict[str, np.ndarray]:
+def scored(candidate: Candidate, reference: Reference, measured: Measurement) -> dict[str, np.ndarray]:
     """All scores of one prediction."""
-    measured = reference.measure(candidate)
     angles, fixed = two_view(candidate, reference.matches), depth_agreement(candidate, reference.common)
     return {
         "s1": measured.epipolar.values,
@@ -148,15 +161,30 @@ class Room:
             agreement_before=float(before),
         )  # fmt: skip
 
+    def refined(self, name: str, metric: str) -> float:
+        """Change of a metric of the judged set against the frozen model, after bundle adjustment."""
+        column = METRICS.index(metric)
+        return float(self.arrays[f"refined-{name}"][column] - self.arrays[f"{_key(FROZEN)}/{JUDGED}"][column])
+
     def verdict(self, settings: GuardSettings) -> Verdict:
         """What the guard would have said."""
-        base = self.measured(FROZEN)
-        known = np.isfinite(base.epipolar.values) & np.isfinite(base.reprojection.values)
-        covered = len(np.unique(base.epipolar.pairs[known]))
-        if known.sum() < settings.pairs or covered < settings.views * len(ADAPTED_TO):
-            return Verdict(outcome="unknown", reason="", frozen=base)
-        found = [(State(steps=share, strength=s), self.measured((share, s))) for share, s in CANDIDATES[1:]]
-        return judge(base, found, settings)
+        return verdict({state: self.measured(state) for state in CANDIDATES}, settings)
+
+
+def verdict(measured: dict[tuple[float, float], Measurement], settings: GuardSettings) -> Verdict:
+    """The rule of `try_states`, on measurements that are there."""
+    base = measured[FROZEN]
+    known = np.isfinite(base.epipolar.values) & np.isfinite(base.reprojection.values)
+    covered = len(np.unique(base.epipolar.pairs[known]))
+    if known.sum() < settings.pairs or covered < settings.views * len(ADAPTED_TO):
+        return Verdict(outcome="unknown", reason="", frozen=base)
+    return judge(base, [(State(steps=share, strength=s), measured[share, s]) for share, s in CANDIDATES[1:]], settings)
+
+
+def chosen_state(measured: dict[tuple[float, float], Measurement], settings: GuardSettings) -> tuple[float, float]:
+    """The state that the guard uses."""
+    chosen = verdict(measured, settings).chosen
+    return FROZEN if chosen is None else (chosen.state.steps, chosen.state.strength)
 
 
 def _key(candidate: tuple[float, float]) -> str:
@@ -170,7 +198,7 @@ def report(folder: Path) -> None:
     groups = {domain: [room for room in rooms if room.domain == domain] for domain in sorted({r.domain for r in rooms})}
     for domain, group in {**groups, "all": rooms}.items():
         verdicts = [room.verdict(settings) for room in group]
-        chosen = [FROZEN if v.chosen is None else (v.chosen.state.steps, v.chosen.state.strength) for v in verdicts]
+        chosen = [chosen_state({c: room.measured(c) for c in CANDIDATES}, settings) for room in group]
         said = [sum(v.outcome == outcome for v in verdicts) for outcome in ("adapted", "frozen", "unknown")]
         print(f"\n{domain}: {len(group)} rooms; verdict adapted {said[0]}, frozen {said[1]}, unknown {said[2]}")
         for name in SETS:
@@ -180,11 +208,24 @@ def report(folder: Path) -> None:
                 oracle = np.array([max(room.gain(c, name, metric) for c in CANDIDATES) for room in group])
                 print(
                     f"  {name:9s} {metric:8s} always {_summary(always)}  guard {_summary(guarded)}"
-                    f"  oracle {oracle.mean():+.3f}"
+                    f"  oracle {oracle.mean():+.3f}{_interval(guarded)}{_refined(group, name, metric)}"
                 )
     for score in ("s1", "s2", "s3", "s3-fixed", "s1b"):
         print(score, " ".join(f"{name} {metric} {_rank(rooms, score, name, metric):+.2f}"
               for name in ("seen-4", "seen-12", "all-16") for metric in ("auc30", "f1_rel5")))  # fmt: skip
+
+
+def _refined(group: list[Room], name: str, metric: str) -> str:
+    """What bundle adjustment makes of the frozen and of the guarded result, of the set that is judged."""
+    if name != JUDGED:
+        return ""
+    gains = {kind: np.array([room.refined(kind, metric) for room in group]) for kind in ("frozen", "guarded")}
+    return "".join(f"  refined {kind} {_summary(gain)}{_interval(gain)}" for kind, gain in gains.items())
+
+
+def _interval(gains: np.ndarray) -> str:
+    found = paired_interval(gains.tolist())
+    return f" [{found.low:+.3f}, {found.high:+.3f}]"
 
 
 def _summary(gains: np.ndarray) -> str:

@@ -32,11 +32,13 @@ from freegeo.data.procedural import get_domain, photograph_room
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.matches import Matches, find_matches
 from freegeo.evidence.refinement import Refinement, bring_depth, parallax_px, refine
+from freegeo.evidence.tracks import join_matches, triangulate
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.geometry.depth import valid_depth
 from freegeo.metrics.bootstrap import paired_interval
 from freegeo.metrics.pose import pair_errors, pose_auc
 from freegeo.metrics.scene import evaluate
+from freegeo.types import PhotoLike
 
 DOMAINS = "test-id,big,tex,sparse,light"
 SCORES = ("auc05", "auc15", "auc30", "f1_rel5", "abs_rel")
@@ -137,23 +139,17 @@ def photos(arguments: argparse.Namespace) -> list[dict]:
     """Measure folders of real photos with true cameras; one row for each folder and seed."""
     rows = []
     for folder in map(Path, arguments.folders):
-        frames = json.loads((folder / "cameras.json").read_text())["frames"]
-        images = load_photos([str(folder / "images" / frame["name"]) for frame in frames], len(frames))
+        images, truth, K = known_photos(folder)
         started = time.process_time()
         matches = find_matches(images)
         matched = time.process_time() - started
-        K = torch.tensor([frame["K"] for frame in frames], dtype=torch.float64)
-        truth = torch.tensor([frame["w2c"] for frame in frames], dtype=torch.float64)
-        # Six printed digits are not quite a rotation, which the pose score takes for an error of zero.
-        U, _, Vh = torch.linalg.svd(truth[:, :3, :3])
-        truth[:, :3, :3] = U @ Vh
         for seed in range(arguments.seeds):
             wrong = perturbed(truth, arguments.degrees, seed)
             prediction = _prediction(images, matches, wrong, K, 1 + arguments.focal * (-1) ** seed, truth)
             started = time.process_time()
             refinement = refine(prediction, matches)
             seconds = time.process_time() - started
-            row = {"scene": folder.name, "seed": seed, "views": len(frames), "match_s": matched, "refine_s": seconds}
+            row = {"scene": folder.name, "seed": seed, "views": len(images), "match_s": matched, "refine_s": seconds}
             row |= _told(refinement, matches) | {"before": _errors(wrong, truth)}
             row["parallax_px"] = parallax_px(Candidate.of(prediction), matches)
             if refinement.T_cam_world is not None:
@@ -164,12 +160,25 @@ def photos(arguments: argparse.Namespace) -> list[dict]:
     return rows
 
 
-def perturbed(T_cam_world: torch.Tensor, degrees: float, seed: int) -> torch.Tensor:
+def known_photos(folder: Path) -> tuple[list[PhotoLike], torch.Tensor, torch.Tensor]:
+    """Photos of a folder with `cameras.json`, and their true `T_cam_world` (S, 4, 4) and `K` (S, 3, 3)."""
+    frames = json.loads((folder / "cameras.json").read_text())["frames"]
+    images = load_photos([str(folder / "images" / frame["name"]) for frame in frames], len(frames))
+    K, truth = (torch.tensor([frame[key] for frame in frames], dtype=torch.float64) for key in ("K", "w2c"))
+    # Six printed digits are not quite a rotation, which the pose score takes for an error of zero.
+    U, _, Vh = torch.linalg.svd(truth[:, :3, :3])
+    truth[:, :3, :3] = U @ Vh
+    return images, truth, K
+
+
+def perturbed(T_cam_world: torch.Tensor, degrees: float, seed: int, growth: float = 0.1) -> torch.Tensor:
     """Cameras (S, 4, 4) with errors that hang together.
 
     The path bends about one axis, and every camera is turned a third as far on its own; together the median error of
-    the relative rotations of all pairs is `degrees`. Steps grow steadily, by a fifth from one end to the other.
+    the relative rotations of all pairs is `degrees`. Steps grow steadily, from 1 - `growth` to 1 + `growth`.
     """
+    if degrees == 0:
+        return T_cam_world.clone()
     generator = np.random.default_rng(seed)
     count = len(T_cam_world)
     along = torch.linspace(-1, 1, count, dtype=torch.float64)
@@ -185,7 +194,9 @@ def perturbed(T_cam_world: torch.Tensor, degrees: float, seed: int) -> torch.Ten
         turns = turns * degrees / pair_errors(turned, T_cam_world).rotation_deg.median()
     bent = _rotations(turns * np.deg2rad(degrees))
     centres = -(R.mT @ T_cam_world[:, :3, 3:])[..., 0]
-    steps = (centres[1:] - centres[:-1]) * torch.linspace(0.9, 1.1, count - 1, dtype=torch.float64)[:, None]
+    steps = (centres[1:] - centres[:-1]) * torch.linspace(1 - growth, 1 + growth, count - 1, dtype=torch.float64)[
+        :, None
+    ]
     # A bent path: each step is turned with the camera that it starts from.
     world = R.mT @ bent @ R
     moved = torch.cat((centres[:1], centres[:1] + torch.cumsum((world[:-1] @ steps[..., None])[..., 0], dim=0)))
@@ -203,16 +214,24 @@ def _rotations(vectors: torch.Tensor) -> torch.Tensor:
 
 def _prediction(images, matches: Matches, T: torch.Tensor, K: torch.Tensor, focal: float, truth: torch.Tensor):
     """A reconstruction with these cameras; its depth is one number for each view, that of the true points."""
-    from freegeo.evidence.tracks import join_matches, triangulate
+    exact = with_cameras(images, matches, truth, K)
+    depth = np.ones_like(exact.depth_z)
+    for view, (_, z) in enumerate(true_points(exact, matches, truth)):
+        depth[view] = np.nanmedian(z) if np.isfinite(z).any() else 1.0
+    assert valid_depth(torch.from_numpy(depth)).all()
+    return with_errors(exact, T, focal, depth)
 
-    height, width = 48, 64
+
+def with_cameras(images, matches: Matches, T: torch.Tensor, K: torch.Tensor, image_hw=(48, 64)) -> Reconstruction:
+    """A reconstruction with given cameras, K in pixels of the photos, and depth 1."""
+    height, width = image_hw
     scale = np.array([width, height]) / matches.photo_hw[:, ::-1]
     model_K = K.numpy().copy()
     # Resizing keeps corners in place.
     model_K[:, :2, 2] += 0.5
     model_K[:, :2] *= scale[:, :, None]
     model_K[:, :2, 2] -= 0.5
-    exact = Reconstruction(
+    return Reconstruction(
         depth_z=np.ones((len(T), height, width), np.float32),
         conf=np.ones((len(T), height, width), np.float32),
         images=np.zeros((len(T), height, width, 3), np.uint8),
@@ -220,19 +239,30 @@ def _prediction(images, matches: Matches, T: torch.Tensor, K: torch.Tensor, foca
         photo_hw=matches.photo_hw,
         scale_xy=scale,
         offset_xy=np.zeros((len(T), 2)),
-        T_cam_world=truth.numpy().astype(np.float32),
+        T_cam_world=T.numpy().astype(np.float32),
         K=model_K.astype(np.float32),
     )
+
+
+def with_errors(exact: Reconstruction, T: torch.Tensor, focal: float, depth_z: np.ndarray) -> Reconstruction:
+    """The same with other cameras, focal lengths and depth."""
+    K = exact.K.copy()
+    K[:, (0, 1), (0, 1)] *= focal
+    return replace(
+        exact, depth_z=depth_z.astype(np.float32), T_cam_world=T.numpy().astype(np.float32), K=K.astype(np.float32)
+    )
+
+
+def true_points(exact: Reconstruction, matches: Matches, truth: torch.Tensor) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For each view the photo pixels (n, 2) and the depth (n,) of the tracks that it shows, by the true cameras."""
     tracks = join_matches(matches)
     seen = triangulate(Candidate.of(exact), matches, tracks)
-    depth = np.ones_like(exact.depth_z)
-    for view in range(len(T)):
-        own = seen.xyz[tracks.point[tracks.view == view]]
-        z = own @ truth[view, 2, :3].numpy() + float(truth[view, 2, 3])
-        depth[view] = np.nanmedian(z) if np.isfinite(z).any() else 1.0
-    assert valid_depth(torch.from_numpy(depth)).all()
-    model_K[:, (0, 1), (0, 1)] *= focal
-    return replace(exact, depth_z=depth, T_cam_world=T.numpy().astype(np.float32), K=model_K.astype(np.float32))
+    found = []
+    for view in range(len(truth)):
+        rows = tracks.view == view
+        z = seen.xyz[tracks.point[rows]] @ truth[view, 2, :3].numpy() + float(truth[view, 2, 3])
+        found.append((tracks.pixel[rows], z))
+    return found
 
 
 def _errors(T: torch.Tensor, truth: torch.Tensor) -> dict[str, float]:

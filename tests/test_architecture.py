@@ -29,6 +29,7 @@ ALLOWED = {
     "fusion": {"geometry"},
     "metrics": {"data.scene", "geometry"},
     "data": {"geometry"},
+    "cameras": {"data", "evidence", "export", "geometry"},
     "models": {"geometry"},
     "geometry": set(),
     "types": set(),

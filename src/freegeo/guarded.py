@@ -143,4 +143,4 @@ def judge_adapter(
     else:
         adapter.set_strength(0.0)
         used = "The frozen model is used."
-    return replace(verdict, reason=f"{verdict.reason} {used}")
+    return replace(verdict, reason=f"{verdict.reason} {used}", used="verdict" if select else "adapter")

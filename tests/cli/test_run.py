@@ -66,7 +66,9 @@ def finished(tmp_path_factory, photo_folder, tiny) -> Path:
 
 def test_run_writes_what_the_design_says(finished):
     expected = (
-        RESULT_FILES | {"frozen/prediction.npz", "frozen/kept.npz"} | {f"adapter/{name}" for name in ADAPTER_FILES}
+        RESULT_FILES
+        | {"frozen/prediction.npz", "frozen/kept.npz", "matches.npz"}
+        | {f"adapter/{name}" for name in ADAPTER_FILES}
     )
     assert files(finished) - {"report.html"} == expected
     assert not (finished / LOCK_FILE).exists()
@@ -142,7 +144,7 @@ def test_overwrite_replaces_the_result_and_spares_the_users_files(freegeo, photo
     out = tmp_path / "out"
     assert freegeo("run", photo_folder, "-o", out, *tiny, *QUICK).code == 0
     (out / "notes.txt").write_text("mine")
-    outcome = freegeo("run", photo_folder, "-o", out, *tiny, "--no-adapt", "--overwrite")
+    outcome = freegeo("run", photo_folder, "-o", out, *tiny, "--no-adapt", "--refine", "off", "--overwrite")
     assert outcome.code == 0, outcome.err
     assert files(out) - {"report.html"} == RESULT_FILES | {"notes.txt"}
 
@@ -276,7 +278,7 @@ def test_numbers_that_are_not_finite_after_adaptation_leave_the_frozen_result(
 
 
 def test_run_without_adapting_is_the_frozen_reconstruction(freegeo, finished, photo_folder, tiny, tmp_path):
-    assert freegeo("run", photo_folder, "-o", tmp_path / "a", *tiny, "--no-adapt").code == 0
+    assert freegeo("run", photo_folder, "-o", tmp_path / "a", *tiny, "--no-adapt", "--refine", "off").code == 0
     assert freegeo("reconstruct", photo_folder, "-o", tmp_path / "b", *tiny).code == 0
     for name in ("a", "b"):
         assert files(tmp_path / name) - {"report.html"} == RESULT_FILES
@@ -284,6 +286,15 @@ def test_run_without_adapting_is_the_frozen_reconstruction(freegeo, finished, ph
         summary = json.loads((tmp_path / name / "reconstruction.json").read_text())
         assert summary["adapter"] is None
         assert summary["recipe"] is None
+
+
+def test_run_refines_where_the_extra_is_installed(freegeo, finished, photo_folder, tiny, tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap", reason="needs the extra colmap")
+    assert json.loads((finished / "reconstruction.json").read_text())["refinement"]["accepted"] is False
+    monkeypatch.setattr("freegeo.cli.options.find_spec", lambda name: None)
+    outcome = freegeo("run", photo_folder, "-o", tmp_path / "out", *tiny, "--no-adapt")
+    assert outcome.code == 0, outcome.err
+    assert json.loads((tmp_path / "out/reconstruction.json").read_text())["refinement"] is None
 
 
 def test_output_lists_the_files_and_the_licence(freegeo, photo_folder, tiny, tmp_path):

@@ -18,9 +18,11 @@ def summary(**changes):
     }  # fmt: skip
 
 
-def verdict(outcome, trials=(WHOLE, HALF), chosen=None, reason="Because."):
-    frozen = SCORES if trials else NOTHING
-    return {"outcome": outcome, "reason": reason, "pairs": 9, "frozen": frozen, "trials": trials, "chosen": chosen}
+def verdict(outcome, trials=(WHOLE, HALF), chosen=None, used="verdict"):
+    return {
+        "outcome": outcome, "reason": "Because.", "pairs": 9, "used": used, "frozen": SCORES if trials else NOTHING,
+        "trials": trials, "chosen": chosen,
+    }  # fmt: skip
 
 
 def refinement(accepted, **changes):
@@ -60,9 +62,9 @@ def test_an_adapter_that_did_not_help_is_not_used():
 
 
 def test_a_reported_verdict_leaves_the_adapter_in_use():
-    reported = verdict("frozen", reason="Worse. The adapter is used as it was trained (--guard report).")
+    reported = verdict("frozen", used="adapter")
     assert rows(answer(summary(verdict=reported, adapter="adapter"))) == ["frozen", "adapted (used)"]
-    better = verdict("adapted", chosen=1, reason="Better. The adapter is used as it was trained (--guard report).")
+    better = verdict("adapted", chosen=1, used="adapter")
     found = answer(summary(verdict=better, adapter="adapter"))
     assert rows(found) == ["frozen", "adapted (used)", "adapted, strength 0.5, 100 % of steps"]
 

@@ -72,8 +72,10 @@ def _file_camera(image: ColmapImage, camera: ColmapCamera) -> FileCamera:
 def write(known: KnownCameras, folder: Path) -> None:
     """Write a text model without points; photos of one camera share it, with the numbers that they came with.
 
-    UserError when a pose, intrinsics or a size is missing.
+    UserError when a pose, intrinsics or a size is missing, or the folder has a binary model, which readers prefer.
     """
+    if any((folder / f"{name}.bin").exists() for name in ("cameras", "images")):
+        raise UserError(f"{folder}: holds a binary COLMAP model. Choose another folder.")
     cameras: dict[tuple, int] = {}
     images: list[str] = []
     taken = {one.ids[1] for one in known.cameras if one.ids is not None}

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -19,7 +20,9 @@ from freegeo.data.photos import some_of
 from freegeo.errors import UserError
 
 if TYPE_CHECKING:
+    from freegeo.evidence.candidate import Candidate
     from freegeo.evidence.matches import Matches
+    from freegeo.evidence.scores import PairScores
 
 __all__ = ["READINGS", "Convention", "check_convention", "pairs_to_check", "matrix_of", "pose_of"]
 
@@ -41,8 +44,12 @@ FEWEST_MATCHES = 40
 """With fewer matches there is nothing to judge by."""
 FLAT = 0.8
 """Share of a pair's matches on one homography from which it is a turn on the spot or a flat scene."""
-OF_A_PHOTO = 3
-"""A photo is judged by itself when so many of its pairs have an error."""
+SAME_TURN_DEG, SAME_WAY_DEG = 0.5, 2.0
+"""Relative poses that differ by less, in rotation and in the direction of the way, are the same."""
+OF_A_PHOTO, MOST_GOOD = 3, 0.3
+"""A photo is judged by itself when so many of its pairs have an error; it fits when at least this share is small."""
+SEARCHED_MATCHES = 40
+"""Matches of each pair by which an unknown focal length is searched."""
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _FOCAL_RANGE = (0.4, 4.0)
 """Focal lengths that are tried where none is known, in longest sides of the photo."""
@@ -166,7 +173,11 @@ def _verdict(known: KnownCameras, matches: Matches, found: Convention, judged: n
             f"{found.pairs} pairs). Look at the result, or give photos that overlap more."
         )
     ranked = {reading: np.inf if found.behind[reading] else error for reading, error in found.errors.items()}
-    best, second = sorted(ranked, key=ranked.__getitem__)[:2]
+    best = min(ranked, key=ranked.__getitem__)
+    if _same_cameras(known, matches.pairs, best, own):
+        best = own
+    rivals = [reading for reading in READINGS if not _same_cameras(known, matches.pairs, best, reading)]
+    second = min(rivals or set(READINGS) - {best}, key=ranked.__getitem__)
     decided = ranked[best] * CLEARLY <= ranked[second]
     if ranked[best] >= LARGEST_PX:
         return "refused", (
@@ -201,14 +212,47 @@ def _verdict(known: KnownCameras, matches: Matches, found: Convention, judged: n
     )
 
 
+def _same_cameras(known: KnownCameras, pairs: np.ndarray, reading: str, another: str) -> bool:
+    """Whether two readings have the same relative poses, but for a degree or two, so that the choice is no matter.
+
+    Straight ahead without a turn, world-to-camera with OpenCV axes is camera-to-world with OpenGL axes, the world
+    flipped.
+    """
+    poses = {view: one.T_cam_world for view, one in enumerate(known.cameras) if one.T_cam_world is not None}
+    matrices = {view: matrix_of(T, known.convention) for view, T in poses.items()}
+    turns, ways = [], []
+    for i, j in pairs.tolist():
+        one, two = (pose_of(matrices[j], r) @ _inverse(pose_of(matrices[i], r)) for r in (reading, another))
+        cosine = (np.trace(one[:3, :3].T @ two[:3, :3]) - 1) / 2
+        turns.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        lengths = np.linalg.norm(one[:3, 3]) * np.linalg.norm(two[:3, 3])
+        cosine = one[:3, 3] @ two[:3, 3] / lengths if lengths > 0 else 1.0
+        ways.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    return max(turns) < SAME_TURN_DEG and max(ways) < SAME_WAY_DEG
+
+
 def _odd_photos(known: KnownCameras, matches: Matches, errors: np.ndarray) -> list[str]:
-    """Names of photos most of whose pairs have a large error, although most pairs of all photos have a small one."""
-    odd = []
-    for view, name in enumerate(known.names):
-        own = errors[(matches.pairs == view).any(axis=1) & ~np.isnan(errors)]
-        if len(own) >= OF_A_PHOTO and np.median(own) >= LARGEST_PX:
-            odd.append(name)
-    return odd
+    """Return names of the photos whose cameras do not fit the others', although most pairs of photos fit.
+
+    A few pairs are wrongly verified, as the two sides of a symmetric thing are; therefore a photo is odd when most of
+    its pairs have a large error, or when it belongs to a group that only such pairs join to the largest group.
+    """
+    judged = ~np.isnan(errors)
+    pairs, good = matches.pairs[judged], errors[judged] < LARGEST_PX
+    odd = set()
+    for view in range(len(known)):
+        own = good[(pairs == view).any(axis=1)]
+        if len(own) >= OF_A_PHOTO and own.mean() < MOST_GOOD:
+            odd.add(view)
+    group = np.arange(len(known))
+    for i, j in pairs[good]:
+        group[group == group[j]] = group[i]
+    largest = np.bincount(group).argmax()
+    for number in np.unique(group[group != largest]):
+        inside = group[pairs] == number
+        if (inside[:, 0] != inside[:, 1]).sum() >= OF_A_PHOTO:
+            odd |= set(np.flatnonzero(group == number).tolist())
+    return [known.names[view] for view in sorted(odd)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,16 +291,22 @@ class _Trial:
         """Try a reading, with the focal length that fits it best where some are unknown."""
         if not self.free.any() or not len(self.matches.pairs):
             return self._fit(reading, 1.0)
-        low, high = np.log(_FOCAL_RANGE)
+        few = replace(self, matches=_thinned(self.matches, SEARCHED_MATCHES))
+        (low, high), focal = np.log(_FOCAL_RANGE), 1.0
         for _ in range(3):
-            tried = np.linspace(low, high, 12)
-            fits = [self._fit(reading, float(np.exp(value))) for value in tried]
-            k = int(np.argmin([np.inf if np.isnan(fit.error) else fit.error for fit in fits]))
-            low, high = tried[max(k - 1, 0)], tried[min(k + 1, len(tried) - 1)]
-        return fits[k]
+            tried = np.linspace(low, high, 9)
+            errors = [few._scores(reading, float(np.exp(value)))[0].median for value in tried]
+            k = int(np.argmin(np.nan_to_num(errors, nan=np.inf)))
+            focal, low, high = float(np.exp(tried[k])), tried[max(k - 1, 0)], tried[min(k + 1, len(tried) - 1)]
+        return self._fit(reading, focal)
 
     def _fit(self, reading: str, focal: float) -> _Fit:
-        """Try a reading with a focal length, in longest sides, where it is unknown."""
+        scores, candidate = self._scores(reading, focal)
+        behind = self._behind(candidate.T_cam_world.numpy(), candidate.K.numpy())
+        return _Fit(error=scores.median, per_pair=scores.values, behind=behind)
+
+    def _scores(self, reading: str, focal: float) -> tuple[PairScores, Candidate]:
+        """Score a reading with a focal length, in longest sides, where it is unknown."""
         import torch
 
         from freegeo.evidence.candidate import Candidate
@@ -273,8 +323,7 @@ class _Trial:
             scale_xy=torch.ones(count, 2, dtype=torch.float64),
             offset_xy=torch.zeros(count, 2, dtype=torch.float64),
         )
-        scores = epipolar(candidate, self.matches)
-        return _Fit(error=scores.median, per_pair=scores.values, behind=self._behind(candidate.T_cam_world.numpy(), K))
+        return epipolar(candidate, self.matches), candidate
 
     def _behind(self, T: np.ndarray, K: np.ndarray) -> bool:
         """Whether most matched points of most pairs, met by the two rays, lie behind one of the cameras."""
@@ -291,6 +340,16 @@ class _Trial:
             z_second = (np.cross(first, motion[:3, 3]) * normal).sum(1)
             shares.append(float(((z_first > 0) & (z_second > 0)).mean()))
         return bool(shares) and float(np.median(shares)) < 0.5
+
+
+def _thinned(matches: Matches, most: int) -> Matches:
+    """Return at most so many matches of each pair, evenly spaced."""
+    rows = [
+        np.unique(np.linspace(low, high - 1, min(most, high - low)).astype(np.int64))
+        for low, high in pairwise(matches.pair_start.tolist())
+    ]
+    start = np.concatenate(([0], np.cumsum([len(row) for row in rows]))).astype(np.int64)
+    return replace(matches, ends=matches.ends[np.concatenate(rows)], pair_start=start)
 
 
 def _rays(pixel: np.ndarray, K: np.ndarray) -> np.ndarray:

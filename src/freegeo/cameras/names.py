@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
@@ -14,6 +15,8 @@ from freegeo.errors import UserError
 
 if TYPE_CHECKING:
     from freegeo.types import PhotoLike
+
+logger = logging.getLogger(__name__)
 
 __all__ = ["match_names"]
 
@@ -51,6 +54,7 @@ def _by_time(file: CameraFile, photos: Sequence[PhotoLike]) -> list[FileCamera |
         return chosen
     # Counting from 0 and from 1 makes nearly all numbers agree: the order is right, the numbers are not.
     if len(file.cameras) == len(photos):
+        logger.info("%s: the time stamps are not the names of the photos, and are matched in order", file.source)
         return list(file.cameras)
     if any(camera is not None for camera in chosen):
         return chosen

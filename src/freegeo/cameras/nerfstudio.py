@@ -48,9 +48,13 @@ def read(path: Path) -> CameraFile:
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise UserError(f"{path}: has no list of frames.")
-    for key, usual in (("applied_transform", None), ("applied_scale", 1.0)):
-        if content.get(key, usual) != usual:
-            logger.info("%s: its world is the one after %s, which is not undone", path, key)
+    if content.get("applied_transform") is not None:
+        logger.info("%s: its world is the one after applied_transform, which is not undone", path)
+    if content.get("applied_scale", 1.0) != 1.0:
+        logger.warning(
+            "%s: its lengths were multiplied by applied_scale (%s), which is not undone. Give --metric only if these "
+            "lengths are metres.", path, content["applied_scale"],
+        )  # fmt: skip
     return CameraFile(source=str(path), cameras=[_frame(content, frame, path) for frame in frames])
 
 

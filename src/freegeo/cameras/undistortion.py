@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,8 +32,12 @@ WIDEST_DEG = 110.0
 """Field of view of an undistorted photo along either side; a pinhole image stretches what is farther out."""
 WORTH_SAYING_DEG = 10.0
 """A warning names what is lost of the field of view from this on."""
+SMALLEST_SLOPE = 0.1
+"""How much of the way of a ray the lens must show, at least; at a fold it is nothing."""
 _SCALES = (0.05, 8.0)
 """Focal lengths of the undistorted photo that are tried, in those of the original."""
+LONGEST_SIDE = 32_766
+"""What OpenCV can resample."""
 _BORDER, _ALONG = 64, 16
 """Points on each side of the border, and on the way to each of them, at which the lens is looked at."""
 
@@ -109,17 +113,26 @@ def undistort(photo: PhotoLike, camera: KnownCamera) -> UndistortedPhoto:
     """
     if camera.lens is None or camera.K is None:
         raise UserError(f"{photo.name}: distortion and intrinsics are needed to undistort a photo.")
-    lens = _LensCamera.of(camera)
-    height, width = photo.size_hw
+    require_lens(camera.lens)
+    fx, fy, (height, width) = camera.K[0, 0], camera.K[1, 1], photo.size_hw
     try:
-        scale = max(lens.smallest_scale((height, width)), lens.scale_of_widest((height, width)))
+        if max(height, width) > LONGEST_SIDE:
+            raise ValueError(f"sides of more than {LONGEST_SIDE} pixels cannot be resampled")
+        scale = _scale(camera.lens, tuple(camera.K.ravel().tolist()), photo.size_hw)
     except ValueError as error:
         raise UserError(
             f"{photo.name}: the lens ({camera.lens.model}) cannot be undistorted: {error}. Undistort the photos "
             "elsewhere, and give the cameras of the undistorted ones."
         ) from None
-    K = np.array([[scale * lens.K[0, 0], 0, width / 2], [0, scale * lens.K[1, 1], height / 2], [0, 0, 1]])
+    K = np.array([[scale * fx, 0, width / 2], [0, scale * fy, height / 2], [0, 0, 1]])
     return UndistortedPhoto(photo, camera, K)
+
+
+@lru_cache(maxsize=64)
+def _scale(lens: Lens, K: tuple[float, ...], size_hw: tuple[int, int]) -> float:
+    """Focal length of the undistorted photo, in those of the original; photos of one camera share it."""
+    camera = _LensCamera.of(KnownCamera(K=np.reshape(K, (3, 3)), lens=lens))
+    return max(camera.smallest_scale(size_hw), camera.scale_of_widest(size_hw))
 
 
 def undistorted(photos: Sequence[PhotoLike], known: KnownCameras) -> tuple[list[PhotoLike], KnownCameras]:
@@ -140,11 +153,11 @@ def undistorted(photos: Sequence[PhotoLike], known: KnownCameras) -> tuple[list[
         new_photos.append(photo)
         cameras.append(camera)
     if done:
-        _say_fields(done)
+        _say_fields(done, len(photos))
     return new_photos, replace(known, cameras=tuple(cameras))
 
 
-def _say_fields(photos: list[UndistortedPhoto]) -> None:
+def _say_fields(photos: list[UndistortedPhoto], count: int) -> None:
     """Log how much of the field of view is left, of the photo that loses most."""
     before, after, photo = max(
         ((before, after, photo) for photo in photos for before, after in [_fields(photo)]),
@@ -153,8 +166,8 @@ def _say_fields(photos: list[UndistortedPhoto]) -> None:
     lost = max(a - b for a, b in zip(before, after, strict=True))
     logger.log(
         logging.WARNING if lost > WORTH_SAYING_DEG else logging.INFO,
-        "%d photos are undistorted; %s shows %.0f x %.0f of %.0f x %.0f degrees afterwards.",
-        len(photos), photo.name, *after, *before,
+        "%d of %d photos are undistorted; %s shows %.0f x %.0f of %.0f x %.0f degrees afterwards.",
+        len(photos), count, photo.name, *after, *before,
     )  # fmt: skip
 
 
@@ -207,7 +220,7 @@ class _LensCamera:
 
     def smallest_scale(self, size_hw: tuple[int, int]) -> float:
         """Smallest focal length, in those of the original, with which every border pixel is in the original."""
-        scales = np.geomspace(*_SCALES, 64)[::-1]
+        scales = np.geomspace(*_SCALES, 24)[::-1]
         if not self._covered(scales[0], size_hw):
             raise ValueError("the original shows too little around the optical axis, or its numbers are no lens")
         high = scales[0]
@@ -218,7 +231,7 @@ class _LensCamera:
             high = scale
         else:
             return float(high)
-        for _ in range(40):
+        for _ in range(30):
             middle = (low * high) ** 0.5
             low, high = (low, middle) if self._covered(middle, size_hw) else (middle, high)
         return float(high)
@@ -236,11 +249,13 @@ class _LensCamera:
             (np.full_like(v, end), v) for end in (u[0], u[-1])
         ]
         border = np.concatenate([np.stack(side, axis=1) for side in sides]) / (scale * self.K[[0, 1], [0, 1]])
-        steps = np.linspace(0, 1, _ALONG + 1)[1:]
+        # The last step is short: a fold shows in the slope at the border first.
+        steps = np.append(np.linspace(0, 1, _ALONG)[1:-1], (0.999, 1.0))
         places = self.pixels((steps[:, None, None] * border).reshape(-1, 2)).reshape(_ALONG, -1, 2)
         distance = np.linalg.norm((places - self.K[:2, 2]) / self.K[[0, 1], [0, 1]], axis=2)
         inside = (places >= 0).all() and (places <= np.array([width, height])).all()
-        return bool(inside and (np.diff(distance, axis=0) > 0).all())
+        ways = np.diff(steps, prepend=0)[1:, None] * np.linalg.norm(border, axis=1)
+        return bool(inside and (np.diff(distance, axis=0) > SMALLEST_SLOPE * ways).all())
 
     def field_deg(self, size_hw: tuple[int, int]) -> tuple[float, float]:
         """Horizontal and vertical field of view of the original through its principal point, below 180 degrees."""

@@ -42,6 +42,7 @@ COMMANDS = {
     "adapt": ("freegeo.cli.adapt:adapt", "Adapt a model to one or several scenes and save the adapter."),
     "reconstruct": ("freegeo.cli.reconstruct:reconstruct", "Reconstruct with a frozen model or a saved adapter."),
     "adapter": ("freegeo.cli.adapter:app", "Fold a saved adapter into the weights of its model."),
+    "cameras": ("freegeo.cli.cameras:app", "Check known cameras against photos, and convert them."),
     "refine": ("freegeo.cli.refine:refine", "Bring a result's cameras to its photos by bundle adjustment."),
     "export": ("freegeo.cli.export:export", "Write a reconstruction in other tools' formats."),
     "view": ("freegeo.cli.view:view", "Look at results in the browser, before and after adaptation."),

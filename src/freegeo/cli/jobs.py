@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
 from freegeo.cli.files import FileOptions, require_complete
-from freegeo.cli.options import ModelOptions, OutputOptions, RecipeOptions, Refine
+from freegeo.cli.options import ModelOptions, OutputOptions, RecipeOptions
 from freegeo.export import reconstruction as npz
 from freegeo.export.base import KEPT_NAME, TRACKS_NAME
 from freegeo.export.formats import FORMATS
@@ -80,7 +80,7 @@ def run_job(
     mixed: Mixed = MIXED,
     files: FileOptions = DEFAULT_FILES,
     guard: Guard = "select",
-    refine: Refine = "off",
+    refine: bool = False,
     extra_settings: dict[str, Any] | None = None,
     after: Callable[[Job], None] = lambda job: None,
 ) -> None:
@@ -113,7 +113,7 @@ def run_job(
         **(extra_settings or {}),
         "adaptation": adaptation,
         "prediction": {"reference": model_options.reference or empty.spec.reference},
-        "refinement": refine,
+        "refinement": "ba" if refine else "off",
         "filters": files.filter_settings(masks),
         "formats": formats,
     }
@@ -129,7 +129,7 @@ def run_job(
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), warnings=console.warned(), after=after, formats=formats, photos=photos,
             filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity, guard=guard,
-            refine=refine == "ba",
+            refine=refine,
             scene=None if plan is None else lambda model: scene_images("photos", photos, model, plan, batch),
         )  # fmt: skip
         summary = job.run()

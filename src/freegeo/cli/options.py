@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -19,8 +20,9 @@ from freegeo.errors import UserError
 from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL, entry, warn_of_embedded_model
 from freegeo.models.spec import MIXED, Mixed
 
-Refine = Literal["off", "ba"]
-"""What follows a prediction: nothing, or bundle adjustment of matches between the photos (docs/refinement.md)."""
+Refine = Literal["auto", "ba", "off"]
+"""Whether bundle adjustment of matches between the photos follows (docs/refinement.md); `auto`: where its extra is
+installed."""
 SMALL_MODEL = 20_000_000
 """Parameters below which a model runs on one CPU thread."""
 
@@ -145,12 +147,15 @@ def model_of_adapter(adapter: Path, model: str | None) -> str:
     return made_for
 
 
-def require_refinement(refine: Refine) -> None:
-    """Raise UserError when what a refinement needs is not installed; called before anything slow."""
+def refines(refine: Refine) -> bool:
+    """Whether bundle adjustment follows; UserError where it is asked for and not installed."""
+    if refine == "auto":
+        return find_spec("pycolmap") is not None
     if refine == "ba":
         from freegeo.evidence.bundle import pycolmap_module
 
         pycolmap_module()
+    return refine == "ba"
 
 
 def use_few_threads(model: ReconstructionModel) -> None:
@@ -194,7 +199,7 @@ class RecipeOptions:
         """Return the recipe for a model; UserError when something that it needs is not installed."""
         recipe = named(self.recipe, spec, self.dataset).changed(**self.changes())
         if recipe.cameras:
-            require_refinement("ba")
+            refines("ba")
         return recipe
 
     def changes(self) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from freegeo.cli.files import FileOptions
 from freegeo.cli.jobs import DEFAULT_FILES, run_job
-from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, Refine, require_refinement
+from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, Refine, refines
 from freegeo.cli.sources import load_source
 
 DEFAULT_MODEL, DEFAULT_PHOTOS = ModelOptions(), PhotoOptions()
@@ -32,11 +32,11 @@ def reconstruct(
         model is used.
     refine
         ba: bring the cameras to the matches between the photos by bundle adjustment, where matches that had no part in
-        it then fit better (needs the extra: pip install 'freegeo[colmap]'); off.
+        it then fit better (needs the extra: pip install 'freegeo[colmap]'); auto: ba where the extra is installed; off.
     """
     from freegeo.adaptation.adapter_files import find_adapter
 
-    require_refinement(refine)
+    refining = refines(refine)
     if adapter is not None:
         adapter = find_adapter(adapter)
         model = model.for_adapter(adapter)
@@ -44,5 +44,5 @@ def reconstruct(
     model.warn_of_embedded(sources)
     run_job(
         found, model, output, command="reconstruct", recipe=None, adapter=adapter, mixed=photos.mixed, files=files,
-        refine=refine,
+        refine=refining,
     )  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli.files import FileOptions
 from freegeo.cli.jobs import DEFAULT_FILES, run_job
-from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions, Refine, require_refinement
+from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions, Refine, refines
 from freegeo.cli.sources import load_source
 
 DEFAULT_RECIPE, DEFAULT_MODEL, DEFAULT_PHOTOS = RecipeOptions(), ModelOptions(), PhotoOptions()
@@ -20,7 +20,7 @@ def run(
     files: FileOptions = DEFAULT_FILES,
     adapt: bool = True,
     guard: Guard = "select",
-    refine: Refine = "off",
+    refine: Refine = "auto",
 ) -> None:
     """Reconstruct photos with a model adapted to them.
 
@@ -37,12 +37,12 @@ def run(
         asked; off.
     refine
         ba: bring the cameras to the matches by bundle adjustment, where matches that had no part in it then fit better
-        (needs the extra: pip install 'freegeo[colmap]'); off.
+        (needs the extra: pip install 'freegeo[colmap]'); auto: ba where the extra is installed; off.
     """
-    require_refinement(refine)
+    refining = refines(refine)
     found = load_source(sources, photos)
     model.warn_of_embedded(sources)
     plan = recipe if adapt else None
     run_job(
-        found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files, guard=guard, refine=refine
+        found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files, guard=guard, refine=refining
     )

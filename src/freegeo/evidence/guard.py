@@ -130,6 +130,8 @@ class Verdict:
     """The trial to use; None: the frozen model."""
     pairs: int = 0
     """Pairs of views that had a say."""
+    used: Literal["verdict", "adapter"] = "verdict"
+    """Whether the result follows the verdict, or is the adapter's as it was trained."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the verdict as JSON-like values; what is unknown is None."""
@@ -137,6 +139,7 @@ class Verdict:
             "outcome": self.outcome,
             "reason": self.reason,
             "pairs": self.pairs,
+            "used": self.used,
             "frozen": self.frozen.as_dict(),
             "trials": [
                 {

@@ -96,7 +96,7 @@ def _rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     trials, chosen = verdict.get("trials") or [], verdict.get("chosen")
     is_adapted, refined = bool(summary.get("adapter")), bool(told.get("accepted"))
     frozen = verdict.get("frozen") or told.get("frozen") or (None if is_adapted else told.get("before"))
-    as_trained = verdict.get("reason", "").endswith("(--guard report).")
+    as_trained = verdict.get("used") == "adapter"
     adapted: list[tuple[str, Mapping[str, Any], bool]] = []
     for number, trial in enumerate(trials):
         whole = trial["steps"] == trial["strength"] == 1
@@ -142,7 +142,7 @@ def _advice(summary: Mapping[str, Any], parts: list[Part]) -> Iterator[str]:
     if adaptation == "unknown" and not verdict and summary.get("filters") is not None:
         yield "--guard select: let the matches decide whether the adapter is used."
     if adaptation == "no" and "Refinement" not in outcomes and summary.get("filters") is not None:
-        yield "--refine ba: bring the cameras to the matches by bundle adjustment instead."
+        yield "--refine ba: bring the cameras to the matches by bundle adjustment (pip install 'freegeo[colmap]')."
     if adaptation == "no" and verdict:
         recipe = summary["recipe"]
         steps = f" (now {recipe['steps']})" if recipe.get("steps") else ""
