@@ -15,7 +15,6 @@ ALLOWED = {
     },
     "posed": {"cameras", "data", "evidence", "export", "geometry", "models"},
     "metres": {"cameras", "data", "export", "geometry"},
-    "cameras": {"data", "evidence", "geometry"},
     "guarded": {"adaptation", "evidence", "export"},
     "refined": {"data", "evidence", "export", "fusion", "guarded", "models"},
     "taught": {"adaptation", "evidence", "export", "geometry", "guarded"},

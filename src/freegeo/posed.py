@@ -133,7 +133,7 @@ def told(known: KnownCameras | None, batch: ImageBatch, spec: ModelSpec) -> tupl
     reason = unusable(priors, spec)
     if reason is None:
         return priors, f"{spec.name} is told the cameras of {known.source}."
-    return None, f"{reason} The cameras of {known.source} are used after prediction."
+    return None, f"{reason} The cameras of {known.source} have no part in its prediction."
 
 
 def model_K(known: KnownCameras, scale_xy: Tensor, offset_xy: Tensor) -> Tensor:

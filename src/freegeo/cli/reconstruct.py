@@ -6,10 +6,19 @@ from pathlib import Path
 
 from freegeo.cli.files import FileOptions
 from freegeo.cli.jobs import DEFAULT_FILES, run_job
-from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, Refine, refines
+from freegeo.cli.options import (
+    CameraOptions,
+    ModelOptions,
+    OutputOptions,
+    PhotoOptions,
+    PlacingOptions,
+    Refine,
+    refines_with,
+)
 from freegeo.cli.sources import load_source
 
 DEFAULT_MODEL, DEFAULT_PHOTOS = ModelOptions(), PhotoOptions()
+NO_CAMERAS, DEFAULT_PLACING = CameraOptions(), PlacingOptions()
 
 
 def reconstruct(
@@ -17,6 +26,8 @@ def reconstruct(
     output: OutputOptions,
     model: ModelOptions = DEFAULT_MODEL,
     photos: PhotoOptions = DEFAULT_PHOTOS,
+    cameras: CameraOptions = NO_CAMERAS,
+    placing: PlacingOptions = DEFAULT_PLACING,
     files: FileOptions = DEFAULT_FILES,
     adapter: Path | None = None,
     refine: Refine = "off",
@@ -36,7 +47,7 @@ def reconstruct(
     """
     from freegeo.adaptation.adapter_files import find_adapter
 
-    refining = refines(refine)
+    refining = refines_with(cameras, refine)
     if adapter is not None:
         adapter = find_adapter(adapter)
         model = model.for_adapter(adapter)
@@ -44,5 +55,5 @@ def reconstruct(
     model.warn_of_embedded(sources)
     run_job(
         found, model, output, command="reconstruct", recipe=None, adapter=adapter, mixed=photos.mixed, files=files,
-        refine=refining,
+        refine=refining, cameras=cameras, placing=placing,
     )  # fmt: skip

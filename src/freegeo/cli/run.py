@@ -5,10 +5,20 @@ from __future__ import annotations
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli.files import FileOptions
 from freegeo.cli.jobs import DEFAULT_FILES, run_job
-from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions, Refine, refines
+from freegeo.cli.options import (
+    CameraOptions,
+    ModelOptions,
+    OutputOptions,
+    PhotoOptions,
+    PlacingOptions,
+    RecipeOptions,
+    Refine,
+    refines_with,
+)
 from freegeo.cli.sources import load_source
 
 DEFAULT_RECIPE, DEFAULT_MODEL, DEFAULT_PHOTOS = RecipeOptions(), ModelOptions(), PhotoOptions()
+NO_CAMERAS, DEFAULT_PLACING = CameraOptions(), PlacingOptions()
 
 
 def run(
@@ -17,6 +27,8 @@ def run(
     model: ModelOptions = DEFAULT_MODEL,
     recipe: RecipeOptions = DEFAULT_RECIPE,
     photos: PhotoOptions = DEFAULT_PHOTOS,
+    cameras: CameraOptions = NO_CAMERAS,
+    placing: PlacingOptions = DEFAULT_PLACING,
     files: FileOptions = DEFAULT_FILES,
     adapt: bool = True,
     guard: Guard = "select",
@@ -39,10 +51,11 @@ def run(
         ba: bring the cameras to the matches by bundle adjustment, where matches that had no part in it then fit better
         (needs the extra: pip install 'freegeo[colmap]'); auto: ba where the extra is installed; off.
     """
-    refining = refines(refine)
+    refining = refines_with(cameras, refine)
     found = load_source(sources, photos)
     model.warn_of_embedded(sources)
     plan = recipe if adapt else None
     run_job(
-        found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files, guard=guard, refine=refining
-    )
+        found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files, guard=guard, refine=refining,
+        cameras=cameras, placing=placing,
+    )  # fmt: skip
