@@ -314,6 +314,17 @@ def test_an_adapter_trained_with_cameras_is_another_one_and_says_so(photos, tmp_
     assert not same(tensors(results[0]), tensors(results[1])) and not same(tensors(results[1]), tensors(results[2]))
 
 
+def test_an_adapter_trained_with_cameras_and_used_without_is_doubted(photos, tmp_path, caplog):
+    options = {"cameras": known_for(photos), "trust_cameras": True}
+    made = freegeo.adapt(tiny_da3(), photos, steps=2, sets=2, guard="off", **options)
+    made.save(tmp_path)
+    caplog.clear()
+    freegeo.reconstruct(tiny_da3(), photos, adapter=tmp_path, **options)
+    assert "the adapter was trained" not in caplog.text
+    freegeo.reconstruct(tiny_da3(), photos, adapter=tmp_path)
+    assert "trained with known cameras, and is used without them" in caplog.text
+
+
 def test_an_unfinished_run_is_not_continued_with_other_cameras(photos, tmp_path):
     def stopped(progress):
         if progress.step == 1:

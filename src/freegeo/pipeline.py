@@ -198,6 +198,10 @@ def reconstruct(
     source = None if scale is None else read_scale(scale, found)
     batch = read_photos(model, found, mixed=mixed)
     priors = _told(known, batch, model.spec)
+    if isinstance(adapter, str | Path):
+        about = adapter_files.adapter_metadata(adapter_files.find_adapter(adapter)) or {}
+        if said := _other_use(about, priors):
+            logger.warning("%s: %s", adapter, said)
     with _applied(model, adapter):
         result = predict(model, batch, reference=reference, priors=priors, compute=compute)
     if known is not None:
@@ -242,6 +246,17 @@ def _applied(model: ReconstructionModel, adapter: Adapter | str | Path | None) -
             "with freegeo.load_adapter."
         )
     return adapter.applied()
+
+
+def _other_use(metadata: Mapping[str, Any], priors: Priors | None) -> str | None:
+    """Say that an adapter was trained with known cameras and is used without, or the reverse; None where it was not."""
+    trained = bool(metadata.get("with_cameras"))
+    if not metadata or trained == (priors is not None):
+        return None
+    with_or_without = (
+        "with known cameras, and is used without" if trained else "without known cameras, and is used with"
+    )
+    return f"the adapter was trained {with_or_without} them, for which it was not made."
 
 
 @contextmanager
@@ -591,13 +606,8 @@ class Job:
             return None
         about = adapter_files.adapter_metadata(self.adapter) or {}
         verdict = about.get("verdict") or {}
-        if bool(about.get("with_cameras")) != (self.priors is not None):
-            with_and_without = ("with", "without") if about.get("with_cameras") else ("without", "with")
-            self._warn(
-                "{}: was trained {} known cameras, and is used {} them; it was not made for that.".format(
-                    self.adapter, *with_and_without
-                )
-            )
+        if said := _other_use(about, self.priors):
+            self._warn(f"{self.adapter}: {said}")
         doubt = about.get("trouble") or (verdict.get("reason") if verdict.get("outcome") != "adapted" else None)
         if doubt:
             self._warn(f"{self.adapter}: an adapter to be doubted. {_capital(doubt)}")
@@ -735,7 +745,7 @@ class Job:
         if self.known is not None:
             posed = with_known_cameras(predicted, self.known)
             predicted = posed.result
-            about["known_cameras"] = {**posed.about, "told_to_model": self.priors is not None}
+            about["known_cameras"] = {**posed.about, "model": told(self.known, self.batch, self.spec)[1]}
         if self.one_camera:
             assert self.photos is not None
             predicted, about["one_camera"] = with_one_camera(predicted, self.photos, self.known)

@@ -13,6 +13,7 @@ sys.path.append(str(TESTS))  # parity_da3.py is shared with the full parity run 
 
 from fixture_tools import relative_error  # noqa: E402
 from freegeo.errors import UserError  # noqa: E402
+from freegeo.geometry.se3 import normalise_poses  # noqa: E402
 from freegeo.models import reference  # noqa: E402
 from freegeo.models.priors import usable  # noqa: E402
 from freegeo.types import Priors  # noqa: E402
@@ -100,6 +101,15 @@ def test_known_cameras_are_normalised_by_the_model(model, tokens):
     for other in (replace(priors, T_cam_world=moved), replace(priors, has_pose=torch.ones(5, dtype=torch.bool))):
         one, two = (model.aggregate(tokens, reference="middle", priors=p).levels for p in (priors, other))
         assert all(relative_error(two[layer][0], one[layer][0]) < 1e-4 for layer in one)
+
+
+@torch.no_grad()
+def test_priors_are_what_a_caller_would_normalise_and_encode(model, tokens):
+    """To the bit: the benchmark's numbers with given cameras are made so."""
+    priors = known_cameras()
+    known = model.encode_cameras(normalise_poses(priors.T_cam_world), priors.K, tokens.image_hw)
+    ours, by_hand = model.aggregate(tokens, priors=priors), model.mix(tokens, model.config.out_layers, None, known)
+    assert all(torch.equal(ours.levels[layer][0], by_hand.levels[layer][0]) for layer in by_hand.levels)
 
 
 @pytest.mark.parametrize("missing", [{"K": None}, {"T_cam_world": None}, {"has_pose": torch.arange(5) > 0}])

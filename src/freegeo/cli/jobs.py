@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -35,6 +36,8 @@ LABELS = {
     "photos": "other photos", "photo_contents": _OTHER_CONTENTS, "contents": _OTHER_CONTENTS, "scenes": "other scenes",
     "checkpoint": "other weights", "weights": "another adapter", "folder": "--adapter", "masks": "other masks",
     "known_cameras": "other known cameras",
+    "scale": "another --scale",
+    "one_camera": "--one-camera",
     "command": "the command", "recipe": "--adapt", "name": "--recipe", "sets_per_scene": "--sets",
     "adapting_precision": "--precision", "refinement": "--refine",
     **dict.fromkeys(
@@ -178,7 +181,7 @@ def placing_settings(known: KnownCameras | None, scale: ScaleSource | None, *, o
 
     values = {
         "known_cameras": None if known is None else digest(known), "one_camera": one_camera,
-        "scale": None if scale is None else repr(scale),
+        "scale": None if scale is None else hashlib.sha256(repr(scale).encode()).hexdigest()[:16],
     }  # fmt: skip
     return {"placing": values} if any(values.values()) else {}
 
