@@ -122,7 +122,7 @@ def test_a_straight_path_is_told_from_its_reverse_by_what_lies_behind(way):
 
 
 @pytest.mark.parametrize(("flatness", "outcome"), [(0.95, "unchecked"), (0.3, "refused")])
-def test_readings_that_fit_alike_are_left_open_only_where_the_photos_cannot_tell(flatness, outcome, caplog):
+def test_readings_that_fit_alike_are_left_open_only_where_the_photos_cannot_tell(flatness, outcome):
     """The cameras nod and the points are so far away that the way up, along which they shift, hardly shows."""
     rng = np.random.default_rng(0)
     T = np.tile(np.eye(4), (3, 1, 1))

@@ -112,9 +112,6 @@ def test_colmap_survives_a_way_through_cameras_json(lens, known, tmp_path):
     colmap.write(model, tmp_path / "one")
     plain.write(read_camera_file(tmp_path / "one"), tmp_path / "cameras.json")
     colmap.write(read_camera_file(tmp_path / "cameras.json"), tmp_path / "two")
-    for name in ("cameras.txt", "images.txt"):
-        first, second = ((tmp_path / folder / name).read_text() for folder in ("one", "two"))
-        assert len(first.split("\n")) == len(second.split("\n"))
     back = read_camera_file(tmp_path / "two")
     assert back.names == names
     assert all(same(a, b, 1e-9) for a, b in zip(back.cameras, cameras, strict=True))

@@ -173,7 +173,7 @@ def test_tangential_distortion_turns_with_the_photo(known, tmp_path):
     ("format", "orientation", "size_hw", "words"),
     [
         ("colmap", 3, HW, "cannot be known whether"),
-        ("colmap", 6, (192, 192), "cannot be known whether|another shape"),
+        ("colmap", 6, (192, 192), "another shape"),
         ("colmap", 6, HW[::-1], None),
         ("cameras.json", 3, HW, None),
         ("poses", 6, HW, "cannot be known whether"),
@@ -192,6 +192,18 @@ def test_a_turn_that_cannot_be_known_is_refused(format, orientation, size_hw, wo
         return
     with pytest.raises(UserError, match=words):
         read_cameras(path, photos)
+
+
+@pytest.mark.parametrize(("orientation", "refused"), [(6, True), (1, False)])
+def test_the_size_of_a_square_photo_does_not_tell_its_turn(orientation, refused, known, tmp_path):
+    square = replace(known.cameras[0], size_hw=(192, 192))
+    colmap.write(KnownCameras(names=("00.png",), cameras=(square,), source=""), tmp_path / "model")
+    photos = stored(tmp_path / "p", ["00.png"], (96, 96), orientation)
+    if refused:
+        with pytest.raises(UserError, match="turned by its EXIF data, and it cannot be known whether"):
+            read_cameras(tmp_path / "model", photos)
+    else:
+        assert read_cameras(tmp_path / "model", photos).has_pose.all()
 
 
 def test_lengths_are_metres_when_the_file_or_the_user_says_so(known, scene, tmp_path):
