@@ -5,7 +5,7 @@ Run: python benchmarks/known_cameras.py [--domains test-id,big,...] [--rooms 25]
 
 For each room, the first photos of the path. `told`: the model is told the true cameras and predicts its own; `posed`:
 the result with the known cameras, as `freegeo run --cameras` writes it; `after`: the model sees the photos alone, and
-the known cameras are used after prediction. `--steps 0` leaves adaptation out. Printed are means of the frozen model, and
+the known cameras are used after prediction. `--steps 0` leaves adaptation out. Printed: means of the frozen model, and
 changes against it with their intervals, paired over rooms.
 """
 
