@@ -18,9 +18,11 @@ from freegeo.models import reference
 from freegeo.models.da3 import Backbone
 from freegeo.models.da3_config import DA3Config
 from freegeo.models.da3_images import apply_plan, plan_size, preprocess
+from freegeo.models.da3_metric import fill_sky, to_metres
 from freegeo.models.dpt import uv_embedding
 from freegeo.models.images import normalise
 from freegeo.models.transformer import grid_rope, rotate
+from freegeo.types import Prediction
 
 FUNCTION = 1e-5
 INTRINSICS = 1e-4
@@ -126,6 +128,23 @@ def check_ray_pose(path: Path) -> float:
     return max(errors)
 
 
+def check_metric_alignment(path: Path) -> float:
+    values = read_tensors(path)
+    errors = []
+    for k in range(3):
+        depth, conf, K, T, metric, sky = (
+            values[f"{name}.{k}"] for name in ("depth", "depth_conf", "intrinsics", "extrinsics", "metric_depth", "sky")
+        )
+        # The recorded filling is that of the any-view depth.
+        found = to_metres(Prediction(depth_z=depth, conf=conf, K=K, T_cam_world=to_4x4(T)), metric, sky)
+        ours = {
+            "out_depth": found.depth_z, "out_depth_conf": found.conf, "out_extrinsics": found.T_cam_world[..., :3, :],
+            "out_scale": found.scale[0, 0], "mono_sky_depth": fill_sky(depth, sky),
+        }  # fmt: skip
+        errors += [relative_error(value, values[f"{name}.{k}"]) for name, value in ours.items()]
+    return max(errors) / FUNCTION
+
+
 def check_image_sizes(path: Path) -> float:
     """Sizes, steps and intrinsics of the table, single photos and batches of mixed sizes, of the way we read photos."""
     table = json.loads(path.read_text())
@@ -182,6 +201,7 @@ FUNCTIONS: dict[str, Callable[[Path], float]] = {
     "normalize_extrinsics.safetensors": check_normalize_extrinsics,
     "reference_view.safetensors": check_reference_view,
     "ray_pose.safetensors": check_ray_pose,
+    "metric_alignment.safetensors": check_metric_alignment,
     "image_sizes.json": check_image_sizes,
     "image_pixels.safetensors": check_image_pixels,
 }

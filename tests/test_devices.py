@@ -28,7 +28,7 @@ from freegeo.training.config import TrainConfig
 from freegeo.training.loop import train
 from freegeo.types import ImageBatch, Priors
 from pretend_device import MixedDevicesError, NoFloat64Error, PretendDevice
-from tiny_models import noise, noise_scene, quick, tensors, tiny_da3, tiny_vggt
+from tiny_models import noise, noise_scene, quick, tensors, tiny_da3, tiny_nested, tiny_vggt
 
 ONCE_A_RUN = {
     "adaptation/adapt.py:_train",  # the model moves to the device
@@ -228,12 +228,28 @@ def test_a_stopped_adaptation_continues_on_its_device(tmp_path):
         torch.testing.assert_close(one, two)
 
 
-def test_a_prediction_comes_back_from_its_device():
-    images, whole = noise(3), torch.tensor([[32, 32]] * 3)
-    batch = ImageBatch(
-        images=images, names=("a", "b", "c"), photo_hw=whole, scale_xy=torch.ones(3, 2).double(),
-        offset_xy=torch.zeros(3, 2).double(),
+def three_images() -> ImageBatch:
+    """Noise, as a model reads it."""
+    return ImageBatch(
+        images=noise(3), names=("a", "b", "c"), photo_hw=torch.tensor([[32, 32]] * 3),
+        scale_xy=torch.ones(3, 2).double(), offset_xy=torch.zeros(3, 2).double(),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("device", ["cuda", "mps"])
+@pytest.mark.parametrize("pose_from", ["camera", "rays"])
+def test_metres_and_cameras_of_rays_are_the_same_on_every_device(device, pose_from):
+    batch = three_images()
+    expected = predict(tiny_nested(), batch, pose_from=pose_from)
+    with pretended(device)():
+        found = predict(tiny_nested(), batch, pose_from=pose_from, compute=Compute(device=torch.device(device)))
+    for name in ("depth_z", "sky", "T_cam_world", "K"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
+    assert found.scale.value == pytest.approx(expected.scale.value, rel=1e-4)
+
+
+def test_a_prediction_comes_back_from_its_device():
+    batch = three_images()
     expected = predict(tiny_vggt(), batch)
     with pretended("cuda")():
         found = predict(tiny_vggt(), batch, compute=Compute(device=torch.device("cuda")))

@@ -23,7 +23,7 @@ from freegeo.geometry.se3 import camera_centres, from_Rt
 from freegeo.geometry.sim3 import Sim3
 from freegeo.models.precision import Compute
 from freegeo.posed import digest, fit_cameras, known_cameras, priors_of, told, undistorted_masks, with_known_cameras
-from tiny_models import attach, noise, quick, same, tensors, tiny_da3, tiny_vggt
+from tiny_models import attach, noise, quick, same, tensors, tiny_da3, tiny_nested, tiny_single_view, tiny_vggt
 
 VIEWS = 5
 FACTOR = 0.37
@@ -203,6 +203,12 @@ def test_a_model_without_cameras_cannot_use_known_ones():
         with_known_cameras(replace(scene, T_cam_world=None, K=None), known_of(scene))
 
 
+def test_a_model_without_cameras_is_refused_before_it_predicts(photos):
+    for options in ({"cameras": known_for(photos)}, {"scale": "gps"}):
+        with pytest.raises(UserError, match="predicts no cameras, so known ones and a scale"):
+            freegeo.reconstruct(tiny_single_view(), photos, **options)
+
+
 def test_map_coordinates_are_refused():
     scene = room(VIEWS)
     photos = freegeo.load_photos(list(scene.images))
@@ -264,6 +270,9 @@ def test_reconstruct_tells_the_model_and_returns_the_given_cameras(photos, caplo
     assert ratio.std() / ratio.mean() > 1e-4  # told, not only scaled
     with pytest.raises(UserError, match="--reference out"):
         freegeo.reconstruct(model, photos, cameras=known, trust_cameras=True, reference="middle")
+    # A metric model is told through its any-view part; the known cameras, of no known unit, decide the lengths.
+    nested = freegeo.reconstruct(tiny_nested(), photos, cameras=known, trust_cameras=True)
+    assert np.array_equal(nested.T_cam_world, given.T_cam_world) and nested.scale is None
     # VGGT is not told, which the log says, and its result has the cameras all the same.
     model = tiny_vggt()
     alone, given = (freegeo.reconstruct(model, photos, cameras=c, trust_cameras=True) for c in (None, known))

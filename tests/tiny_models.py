@@ -1,5 +1,7 @@
 """Models of a few thousand parameters with seeded random weights, adapters on them, and scenes of noise."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
@@ -9,22 +11,37 @@ from freegeo.adaptation.samples import SceneImages
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.da3 import DA3
 from freegeo.models.da3_config import DA3Config
-from freegeo.models.spec import AdaptationDefaults, ModelSpec, Takes
+from freegeo.models.da3_metric import DA3Nested, DA3SingleView
+from freegeo.models.spec import AdaptationDefaults, ModelSpec
 from freegeo.models.vggt import VGGT
 from freegeo.models.vggt_config import VGGTConfig
 
 PATCH = 8
 DEFAULTS = AdaptationDefaults(temperature=1.0, scene_lr=3e-3, rank=4)
+ANY_VIEW = DA3Config(
+    width=32, depth=6, heads=2, out_layers=(2, 3, 4, 5), alt_start=2, qknorm_start=2, rope_start=2,
+    head_features=8, head_channels=(4, 8, 8, 8), patch_size=PATCH, position_grid=4,
+    camera_encoder_depth=1, camera_encoder_heads=2,
+)  # fmt: skip
+SINGLE_VIEW = replace(ANY_VIEW, alt_start=6, qknorm_start=6, rope_start=6, cat_token=False)
 
 
 def tiny_da3(seed: int = 0, ffn: str = "mlp", name: str = "tiny-da3") -> DA3:
     """Two per-view blocks and four cross-view ones, width 32."""
-    config = DA3Config(
-        width=32, depth=6, heads=2, out_layers=(2, 3, 4, 5), alt_start=2, qknorm_start=2, rope_start=2, ffn=ffn,
-        head_features=8, head_channels=(4, 8, 8, 8), patch_size=PATCH, position_grid=4,
-        camera_encoder_depth=1, camera_encoder_heads=2,
-    )  # fmt: skip
-    return randomise(DA3(config, _spec(name, config.out_layers, special=1, takes="cameras")), seed)
+    return randomise(
+        DA3(replace(ANY_VIEW, ffn=ffn), _spec(name, ANY_VIEW.out_layers, special=1, takes="cameras")), seed
+    )
+
+
+def tiny_single_view(seed: int = 0, name: str = "tiny-single-view") -> DA3SingleView:
+    """Six per-view blocks, width 32."""
+    return randomise(DA3SingleView(SINGLE_VIEW, _spec(name, SINGLE_VIEW.out_layers, special=1, cameras=False)), seed)
+
+
+def tiny_nested(seed: int = 0, name: str = "tiny-nested") -> DA3Nested:
+    """The tiny any-view model beside the tiny single-view one."""
+    spec = _spec(name, ANY_VIEW.out_layers, special=1, metric=True, ray_cameras=True, takes="cameras")
+    return randomise(DA3Nested(ANY_VIEW, SINGLE_VIEW, spec), seed)
 
 
 def tiny_vggt(seed: int = 0, name: str = "tiny-vggt") -> VGGT:
@@ -98,10 +115,10 @@ def trained(model: ReconstructionModel, seed: int = 1) -> Adapter:
     return adapter
 
 
-def _spec(name: str, layers: tuple[int, ...], special: int, takes: Takes = "nothing") -> ModelSpec:
+def _spec(name: str, layers: tuple[int, ...], special: int, **more) -> ModelSpec:
     return ModelSpec(
         name=name, patch_size=PATCH, default_side=4 * PATCH, loss_layers=layers, reference="first",
-        special_tokens=special, weights_licence="none", adaptation=DEFAULTS, takes=takes,
+        special_tokens=special, weights_licence="none", adaptation=DEFAULTS, **more,
     )  # fmt: skip
 
 

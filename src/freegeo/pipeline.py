@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import torch
@@ -49,8 +49,16 @@ from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import EMBEDDED_MODEL, warn_of_embedded_model
 from freegeo.models.images import read_photos
 from freegeo.models.precision import Compute
-from freegeo.models.spec import MIXED, Mixed, ModelSpec
-from freegeo.posed import check_known, is_one_camera, known_cameras, told, with_known_cameras, with_one_camera
+from freegeo.models.spec import MIXED, Mixed, ModelSpec, PoseFrom
+from freegeo.posed import (
+    check_known,
+    is_one_camera,
+    known_cameras,
+    require_cameras,
+    told,
+    with_known_cameras,
+    with_one_camera,
+)
 from freegeo.progress import step_bar
 from freegeo.refined import refine_by_photos
 from freegeo.report.page import write_report
@@ -100,6 +108,7 @@ def predict(
     *,
     reference: str | None = None,
     priors: Priors | None = None,
+    pose_from: PoseFrom = "camera",
     compute: Compute = CPU,
 ) -> Reconstruction:
     """Reconstruct prepared images with the model and the adapter that is on, if any.
@@ -108,7 +117,7 @@ def predict(
     nothing else. The model is told `priors`; the cameras of the result are those that it predicts. UserError when the
     images do not fit into memory together, FreeGeoError when the model answers with values that are not finite.
     """
-    result = _predict(model, batch, reference=reference, priors=priors, compute=compute)
+    result = _predict(model, batch, reference=reference, priors=priors, pose_from=pose_from, compute=compute)
     trouble = not_finite(result)
     if trouble:
         raise FreeGeoError(f"{trouble} Try --precision fp32, and check the weights.")
@@ -116,7 +125,13 @@ def predict(
 
 
 def _predict(
-    model: ReconstructionModel, batch: ImageBatch, *, reference: str | None, priors: Priors | None, compute: Compute
+    model: ReconstructionModel,
+    batch: ImageBatch,
+    *,
+    reference: str | None,
+    priors: Priors | None,
+    pose_from: PoseFrom,
+    compute: Compute,
 ) -> Reconstruction:
     require_reference(reference, priors)
     plan_reconstruction(model, len(batch), batch.image_hw, compute=compute)
@@ -124,7 +139,10 @@ def _predict(
     with compute.autocast():
         tokens = embed_in_chunks(model, batch.images, device=compute.device)
         features = model.aggregate(tokens, reference=reference or model.spec.reference, priors=priors)
-        prediction = model.decode(features)
+        if pose_from == "rays":
+            prediction = model.decode(features, want=("depth", "ray_cameras"))
+        else:
+            prediction = model.decode(features)
     return Reconstruction.from_prediction(prediction, batch)
 
 
@@ -135,6 +153,14 @@ def require_reference(reference: str | None, priors: Priors | None) -> None:
             f"the first photo is the reference view where the model is told cameras, not that of the rule "
             f"'{reference}'. Leave --reference out."
         )
+
+
+def require_pose_from(spec: ModelSpec, pose_from: PoseFrom) -> None:
+    """Raise UserError when cameras cannot come from there."""
+    if pose_from not in get_args(PoseFrom):
+        raise UserError(f"cameras come from {' or '.join(get_args(PoseFrom))}, not {pose_from!r}.")
+    if pose_from == "rays" and not spec.ray_cameras:
+        raise UserError(f"{spec.name} finds no cameras from rays; only the any-view models of Depth Anything 3 do.")
 
 
 def _capital(sentence: str) -> str:
@@ -166,6 +192,7 @@ def reconstruct(
     precision: str | None = None,
     max_views: int = MAX_VIEWS,
     mixed: Mixed = MIXED,
+    pose_from: PoseFrom = "camera",
 ) -> Reconstruction:
     """Reconstruct photos: depth, confidence and cameras of every view.
 
@@ -187,13 +214,18 @@ def reconstruct(
         mixed: how photos of different shapes become images of one size: `crop` fits the odd ones to the others, `pad`
             puts white around all, `upstream` is the rule of the model's authors. Cutting more than 10 % of a photo
             gives a warning.
+        pose_from: `camera`: cameras of the model's camera head; `rays`: found from the rays that an any-view model of
+            DA3 predicts.
 
     Raises:
         UserError: an argument that cannot be used, or views that do not fit into memory together.
     """
     _require_model(model)
-    _warn_of_embedded_model(model)
+    require_pose_from(model.spec, pose_from)
+    _warn_of_model(model)
     compute = Compute.choose(device, precision)
+    if cameras is not None or scale is not None:
+        require_cameras(model.spec)
     found, known = _with_cameras(load_photos(photos, max_views), cameras, trust=trust_cameras)
     source = None if scale is None else read_scale(scale, found)
     batch = read_photos(model, found, mixed=mixed)
@@ -203,7 +235,7 @@ def reconstruct(
         if said := _other_use(about, priors):
             logger.warning("%s: %s", adapter, said)
     with _applied(model, adapter):
-        result = predict(model, batch, reference=reference, priors=priors, compute=compute)
+        result = predict(model, batch, reference=reference, priors=priors, pose_from=pose_from, compute=compute)
     if known is not None:
         result = with_known_cameras(result, known).result
     if is_one_camera(found) if one_camera is None else one_camera:
@@ -344,7 +376,8 @@ def adapt(
         NoEvidenceError: recipe `evidence`, and the matches between the photos prove no cameras.
     """
     _require_model(model)
-    _warn_of_embedded_model(model)
+    model.adaptable()
+    _warn_of_model(model)
     compute = Compute.choose(device, precision)
     plan = _recipe(recipe, model, dataset).changed(
         steps=steps, epochs=epochs, lr=lr, rank=rank, hold=hold, views=views,
@@ -431,6 +464,7 @@ def judge_by_photos(
     stores: Sequence[Path | None] | None = None,
     judging: Sequence[Matches] | None = None,
     priors: Sequence[Priors | None] | None = None,
+    pose_from: PoseFrom = "camera",
 ) -> None:
     """Judge a finished adapter by the photos of its scenes, and keep the verdict in the result.
 
@@ -447,18 +481,23 @@ def judge_by_photos(
         stores: files for the matches of the scenes; None: they are not stored.
         judging: the matches that judge, where others taught; None: all matches of the photos.
         priors: what the model is told of each scene; None: nothing.
+        pose_from: where cameras of predictions come from.
     """
     known = {id(batch): part for (_, batch), part in zip(scenes, priors or [None] * len(scenes), strict=True)}
 
     def predicted(batch: ImageBatch) -> Reconstruction | None:
-        found = _predict(model, batch, reference=reference, priors=known[id(batch)], compute=compute)
+        found = _predict(
+            model, batch, reference=reference, priors=known[id(batch)], pose_from=pose_from, compute=compute
+        )
         return found if not_finite(found) is None else None
 
     if frozen is None:
         try:
             with result.adapter.off():
                 frozen = [
-                    predict(model, batch, reference=reference, priors=known[id(batch)], compute=compute)
+                    predict(
+                        model, batch, reference=reference, priors=known[id(batch)], pose_from=pose_from, compute=compute
+                    )
                     for _, batch in scenes
                 ]
         except UserError as error:
@@ -469,7 +508,9 @@ def judge_by_photos(
     asked = guard != "off" and all(one.has_cameras for one in frozen)
     if not asked or guard == "report":
         for (_, batch), before in zip(scenes, frozen, strict=True):
-            found = _predict(model, batch, reference=reference, priors=known[id(batch)], compute=compute)
+            found = _predict(
+                model, batch, reference=reference, priors=known[id(batch)], pose_from=pose_from, compute=compute
+            )
             wrong = not_finite(found) or harm(before, found)
             if wrong:
                 result.harm = f"{wrong} Lower --lr (now {result.recipe.lr:g}) or take fewer --steps."
@@ -504,10 +545,15 @@ def _require_model(model: object) -> None:
     raise UserError(f"model is a loaded model, not {type(model).__name__}. Load it with {hint}.")
 
 
-def _warn_of_embedded_model(model: ReconstructionModel) -> None:
-    """Say once what the embedded model is not for."""
-    if model.spec.name == EMBEDDED_MODEL and not _warned_of:
-        _warned_of.append(EMBEDDED_MODEL)
+def _warn_of_model(model: ReconstructionModel) -> None:
+    """Say once what a model is not for, or what its results lack."""
+    name, caution = model.spec.name, model.spec.caution
+    if name in _warned_of or not (caution or name == EMBEDDED_MODEL):
+        return
+    _warned_of.append(name)
+    if caution:
+        logger.warning("%s", caution)
+    else:
         warn_of_embedded_model()
 
 
@@ -569,6 +615,8 @@ class Job:
     """Whether photos of one camera share one focal length."""
     scale: ScaleSource | None = None
     """Where metres come from; None: from known cameras or a metric model, if at all."""
+    pose_from: PoseFrom = "camera"
+    """Where the cameras of all predictions come from."""
     refine: bool = False
     """Whether the cameras are brought to the matches between the photos by bundle adjustment."""
     seed: int = SEED
@@ -644,7 +692,14 @@ class Job:
         if self.adapter is not None:
             assert self.in_place is not None
         with self._timed(stage):
-            result = predict(self.model, self.batch, reference=self.reference, priors=self.priors, compute=self.compute)
+            result = predict(
+                self.model,
+                self.batch,
+                reference=self.reference,
+                priors=self.priors,
+                pose_from=self.pose_from,
+                compute=self.compute,
+            )
             result.save(folder)
         return result
 
@@ -687,6 +742,7 @@ class Job:
                 judge_by_photos(
                     self.model, result, [(self.photos, self.batch)], compute=self.compute, guard=self.guard,
                     reference=self.reference, frozen=[frozen], stores=stores, judging=judging, priors=[self.priors],
+                    pose_from=self.pose_from,
                 )  # fmt: skip
                 seconds["evidence"] = round(time.monotonic() - started, 2)
             result.save(folder)
@@ -703,7 +759,12 @@ class Job:
         assert self.in_place is not None
         with self._timed("adapted prediction"):
             result = _predict(
-                self.model, self.batch, reference=self.reference, priors=self.priors, compute=self.compute
+                self.model,
+                self.batch,
+                reference=self.reference,
+                priors=self.priors,
+                pose_from=self.pose_from,
+                compute=self.compute,
             )
             rejected = not_finite(result)
             if rejected is None:
@@ -827,6 +888,7 @@ class Job:
             **about,
             "frozen_prediction": None if self.recipe is None else f"{FROZEN_FOLDER}/{PREDICTION_NAME}",
             "reference_view": "first" if self.priors is not None else self.reference or self.spec.reference,
+            "pose_from": self.pose_from if self.spec.cameras else None,
             "not_written": dict(failed),
             "warnings": list(self.warnings),
             "loss": self._loss_change(),

@@ -68,6 +68,15 @@ def known_cameras(
     return undistorted(photos, known)
 
 
+def require_cameras(spec: ModelSpec) -> None:
+    """Raise UserError for a model without cameras, whose depth cannot be brought to known ones or to a scale."""
+    if not spec.cameras:
+        raise UserError(
+            f"{spec.name} predicts no cameras, so known ones and a scale cannot be used. Leave --cameras and --scale "
+            "out, or use a model that predicts cameras."
+        )
+
+
 def require_near(known: KnownCameras) -> None:
     """Raise UserError for cameras so far from the origin that points lose their digits (as map coordinates are)."""
     centres = camera_centres(_poses(known)).numpy()

@@ -138,13 +138,12 @@ class ViewTokens:
 
     def tensors(self) -> dict[str, Tensor]:
         """Return everything as named tensors, for a cache or a file."""
-        return {"tokens": self.tokens, **_meta_tensors(self), **{f"extra.{k}": v for k, v in self.extra.items()}}
+        return {"tokens": self.tokens, **_meta_tensors(self), **_extra_tensors(self)}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
         """Rebuild what `tensors` returned."""
-        extra = {k.removeprefix("extra."): v for k, v in tensors.items() if k.startswith("extra.")}
-        return cls(tokens=tensors["tokens"], extra=extra, **_read_meta(tensors))
+        return cls(tokens=tensors["tokens"], extra=_read_extra(tensors), **_read_meta(tensors))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,6 +154,8 @@ class Features:
     """layer -> (patch (B, S, P, C), special (B, S, T, C)); special[..., 0, :] is the camera token."""
     image_hw: tuple[int, int]
     grid_hw: tuple[int, int]
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
+    """What the decoder needs besides, each (B, S, ...)."""
 
     def select(self, views: Sequence[int]) -> Self:
         """Return the chosen views, in the order given ("8->4" is `select([0, 2, 4, 6])`)."""
@@ -165,22 +166,21 @@ class Features:
         return self._map(lambda t: t.to(*args, **kwargs))
 
     def _map(self, change) -> Self:
-        return replace(
-            self, levels={k: (change(patch), change(special)) for k, (patch, special) in self.levels.items()}
-        )
+        levels = {k: (change(patch), change(special)) for k, (patch, special) in self.levels.items()}
+        return replace(self, levels=levels, extra={k: change(value) for k, value in self.extra.items()})
 
     def tensors(self) -> dict[str, Tensor]:
         """Return everything as named tensors, for a cache or a file."""
         named = {f"{layer}.patch": patch for layer, (patch, _) in self.levels.items()}
         named |= {f"{layer}.special": special for layer, (_, special) in self.levels.items()}
-        return {**named, **_meta_tensors(self)}
+        return {**named, **_meta_tensors(self), **_extra_tensors(self)}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
         """Rebuild what `tensors` returned."""
         layers = sorted(int(k.removesuffix(".patch")) for k in tensors if k.endswith(".patch"))
         levels = {i: (tensors[f"{i}.patch"], tensors[f"{i}.special"]) for i in layers}
-        return cls(levels=levels, **_read_meta(tensors))
+        return cls(levels=levels, extra=_read_extra(tensors), **_read_meta(tensors))
 
 
 def _views(tensor: Tensor, views: Sequence[int]) -> Tensor:
@@ -190,6 +190,14 @@ def _views(tensor: Tensor, views: Sequence[int]) -> Tensor:
 
 def _meta_tensors(value: ViewTokens | Features) -> dict[str, Tensor]:
     return {name: torch.tensor(getattr(value, name)) for name in _META_KEYS}
+
+
+def _extra_tensors(value: ViewTokens | Features) -> dict[str, Tensor]:
+    return {f"extra.{name}": tensor for name, tensor in value.extra.items()}
+
+
+def _read_extra(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix("extra."): value for name, value in tensors.items() if name.startswith("extra.")}
 
 
 def _read_meta(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, int]]:
@@ -265,7 +273,8 @@ class Prediction:
     points: Tensor | None = None
     """(..., S, H, W, 4): world point and its confidence."""
     scale: Tensor | None = None
-    """(...): factor that turned all lengths into metres, applied already; None: they are up to scale."""
+    """(..., 2): factor that turned all lengths into metres, applied already, and the relative spread of the factors of
+    single views (nan for one view); None: lengths are up to scale."""
 
     def map(self, change) -> Self:
         """Apply `change` to every tensor that is there."""

@@ -270,7 +270,9 @@ def test_layers_whose_names_only_end_like_a_target_stay_untouched():
 
 
 @pytest.mark.parametrize(
-    ("name", "counts"), [("da3-giant", GIANT_COUNTS), ("vggt-1b", VGGT_COUNTS)], ids=["da3-giant", "vggt-1b"]
+    ("name", "counts"),
+    [("da3-giant", GIANT_COUNTS), ("da3nested-giant-large", GIANT_COUNTS), ("vggt-1b", VGGT_COUNTS)],
+    ids=["da3-giant", "da3nested-giant-large", "vggt-1b"],
 )
 def test_trainable_parameters_are_the_published_counts(name, counts):
     model = build_empty(name)

@@ -321,8 +321,6 @@ def test_models_fit_a_terminal_and_name_every_licence(freegeo):
     for name in catalog.names():
         (line,) = [line for line in lines if line.split()[:1] == [name]]
         assert catalog.entry(name).licence.split(" (")[0] in line
-    for missing in ("da3mono-large", "da3metric-large", "da3nested-giant-large"):
-        assert missing not in outcome.out
 
 
 @pytest.mark.parametrize(
@@ -358,12 +356,12 @@ def test_describe_says_how_much_memory_is_needed(freegeo):
     assert f"to adapt on a GPU {fast / 1e9:.1f} GB, or {small / 1e9:.1f} GB where that does not fit" in out
 
 
-@pytest.mark.parametrize("command", [("describe",), ("download",), ("check",)])
-def test_models_that_are_not_implemented_say_so(freegeo, weights, command):
-    outcome = freegeo("models", *command, "da3mono-large", *([weights] if command == ("check",) else []))
-    assert outcome.code == 2
-    assert "da3mono-large is not implemented" in outcome.sentence()
-    assert "use da3-small" in outcome.sentence()
+def test_describe_says_what_a_model_of_single_views_lacks(freegeo):
+    out = freegeo("models", "describe", "da3metric-large").out
+    assert "adapter: none, since it looks at each photo by itself" in out
+    assert "to adapt on a GPU" not in out
+    assert "its depth is not in metres yet" in out
+    assert "lengths: metres" in freegeo("models", "describe", "da3nested-giant-large").out
 
 
 def test_check_tells_whether_a_file_fits(freegeo, weights):

@@ -77,7 +77,7 @@ def test_a_model_without_cameras_is_stored_and_says_so(tmp_path):
 
 
 def test_a_metric_prediction_stays_metric_in_the_file(tmp_path):
-    prediction = replace(prediction_of(), scale=torch.tensor([2.5]))
+    prediction = replace(prediction_of(), scale=torch.tensor([[2.5, torch.nan]]))
     stored = Reconstruction.from_prediction(prediction, batch_of())
     assert stored.scale == Scale(value=2.5, source=METRIC_MODEL)
     assert repr(stored).endswith(" cameras, metres)")

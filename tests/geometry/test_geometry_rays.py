@@ -36,8 +36,20 @@ def test_outliers_are_ignored_and_the_seed_decides():
     assert torch.equal(T, again)
 
 
-def test_rays_without_depth_are_refused():
-    with pytest.raises(FreeGeoError, match="usable rays"):
-        cameras_from_rays(torch.zeros(1, 6, 6, 6), torch.ones(1, 6, 6), (48, 48), generator=seeded())
+def test_views_without_usable_rays_have_no_camera_and_disturb_no_other():
+    recorded = load_file(fixture_path("da3", "functions", "ray_pose.safetensors"))
+    rays, confidence = recorded["ray.0"], recorded["ray_conf.0"]
+    image_hw = tuple(recorded["image_size_hw"].tolist())
+    wanted = cameras_from_rays(rays, confidence, image_hw, generator=seeded())
+    for nothing in (0.0, torch.nan):
+        broken = rays.clone()
+        broken[:, 1] = nothing
+        found = cameras_from_rays(broken, confidence, image_hw, generator=seeded())
+        for mine, other in zip(found, wanted, strict=True):
+            assert mine[:, 1].isnan().any()
+            assert torch.equal(mine[:, [0, 2]], other[:, [0, 2]])
+    holed = rays.clone()
+    holed[:, :, 0, 0] = torch.nan
+    assert relative_error(cameras_from_rays(holed, confidence, image_hw, generator=seeded())[0], wanted[0]) < 1e-4
     with pytest.raises(FreeGeoError, match="too small"):
         cameras_from_rays(torch.ones(1, 2, 2, 6), torch.ones(1, 2, 2), (16, 16), generator=seeded())

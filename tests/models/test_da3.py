@@ -13,6 +13,7 @@ sys.path.append(str(TESTS))  # parity_da3.py is shared with the full parity run 
 
 from fixture_tools import relative_error  # noqa: E402
 from freegeo.errors import UserError  # noqa: E402
+from freegeo.geometry.rays import cameras_from_rays  # noqa: E402
 from freegeo.geometry.se3 import normalise_poses  # noqa: E402
 from freegeo.models import reference  # noqa: E402
 from freegeo.models.priors import usable  # noqa: E402
@@ -43,7 +44,7 @@ def known_cameras() -> Priors:
 
 
 def test_recorded_cases_are_found():
-    assert len(RECORDED) == 13
+    assert len(RECORDED) == 20
 
 
 @pytest.mark.parametrize("check", RECORDED.values(), ids=RECORDED.keys())
@@ -120,6 +121,20 @@ def test_a_part_of_the_cameras_is_refused(model, tokens, missing):
         model.aggregate(tokens, priors=priors)
     assert usable(priors, model.spec) is None
     assert usable(known_cameras(), model.spec) is not None
+
+
+@torch.no_grad()
+def test_cameras_of_rays_are_those_of_the_ray_map_and_the_same_every_time(model, tokens):
+    features = model.aggregate(tokens)
+    rays = model.decode(features, want=("rays",)).rays
+    found, again = (model.decode(features, want=("depth", "ray_cameras")) for _ in range(2))
+    T, K = cameras_from_rays(rays[..., :6], rays[..., 6], (28, 42), generator=torch.Generator().manual_seed(0))
+    assert torch.equal(found.T_cam_world, T) and torch.equal(found.K, K)
+    assert torch.equal(again.T_cam_world, T) and torch.equal(again.K, K)
+    assert found.rays is None and found.depth_z.shape == (2, 5, 28, 42)
+    assert relative_error(found.K, model.decode(features).K) > 1e-3
+    with pytest.raises(UserError, match="one of both"):
+        model.decode(features, want=("cameras", "ray_cameras"))
 
 
 @torch.no_grad()

@@ -275,11 +275,15 @@ class Shape:
 
 
 def shape_of(model: ReconstructionModel) -> Shape:
-    """Read a model's shape off its adapter targets; the model may be on the meta device, and may carry an adapter."""
-    part = model.adaptable()
+    """Read a model's shape off its adapter targets; the model may be on the meta device, and may carry an adapter.
+
+    A model of single views has none; its shape is read off all its linears.
+    """
+    part = model.cross_view or model
     # The layers of an adapter that is on are linears, too.
     names = [name for name in part.adapter_targets() if ".lora_" not in name]
     linears = [_base(part.get_submodule(name)) for name in names]
+    linears = linears or [module for module in part.modules() if isinstance(module, nn.Linear)]
     attention = [linear for linear in linears if linear.out_features == 3 * linear.in_features]
     # A third-party model may have no joint qkv layer; then the width is taken from its first layer.
     width = (attention or linears)[0].in_features
@@ -323,7 +327,7 @@ def plan_reconstruction(
     of views. `budget` (bytes) None: what is free now, plus what the model already occupies. UserError when the views
     do not fit; it says how many would. The model may be on the meta device.
     """
-    shape, spec = shape_of(model), model.adaptable().spec
+    shape, spec = shape_of(model), model.spec
     resident = shape.parameters * WIDE
     budget = available(compute.device, model) if budget is None else budget
     pixels = math.prod(image_hw)
@@ -331,7 +335,7 @@ def plan_reconstruction(
     maps = 2 * WIDE * pixels  # depth and confidence
     # Widest moment of the dense head per view: half of its channels and its last layers at image size, and three maps
     # of all channels at 8 per patch.
-    head = getattr(getattr(model.adaptable(), "config", None), "head_features", 256)
+    head = getattr(getattr(model.cross_view or model, "config", None), "head_features", 256)
     head_bytes = int(WIDE * pixels * (head / 2 + 48 + 3 * head * (8 / spec.patch_size) ** 2))
     passing, copies = shape.passing(compute, with_adapter=False), shape.half_copies(compute)
 

@@ -63,6 +63,7 @@ def adapt(
 
     check_place(output)
     empty = model.build_empty()
+    empty.adaptable()
     plan = recipe.build(empty.spec)
     scenes = {str(part[0]): load_source(part, photos) for part in split_scenes(sources)}
     model.warn_of_embedded(sources)

@@ -360,14 +360,18 @@ def _has_own(entry: Experiment, tables: Sequence) -> bool:
 def _adaptation(model: str) -> AdaptationDefaults:
     from freegeo.models.catalog import build_empty
 
-    return build_empty(model).spec.adaptation
+    spec = build_empty(model).spec
+    if not spec.cameras:
+        raise UserError(f"{spec.name} predicts no cameras, which the benchmark scores. Choose another model.")
+    return spec.adaptation
 
 
 def _rule(bench: BenchOptions, model: str) -> FrameRule:
     """Return the frame rule of a run: the one asked for, or that of the model's family."""
     from freegeo.benchmark.tasks import family_rule
 
-    return bench.frames or family_rule(_adaptation(model))
+    own = family_rule(_adaptation(model))
+    return bench.frames or own
 
 
 def _figures(bench: BenchOptions) -> None:

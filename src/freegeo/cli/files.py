@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from freegeo.errors import PartialResultError
-from freegeo.export.base import DEFAULT_FORMATS
+from freegeo.export.base import DEFAULT_FORMATS, FLAT_FORMATS
 from freegeo.export.formats import ALL, FORMATS, check_formats, chosen_formats
 from freegeo.fusion.settings import FilterSettings
 from freegeo.run_folder import stored_state
@@ -35,8 +35,9 @@ def _digest(masks: Sequence[np.ndarray]) -> str:
     return digest.hexdigest()[:16]
 
 
-def _check_formats(hint: object, names: Sequence[str]) -> None:
-    chosen_formats(names)
+def _check_formats(hint: object, names: Sequence[str] | None) -> None:
+    if names is not None:
+        chosen_formats(names)
 
 
 FORMAT_NAMES = Parameter(
@@ -85,7 +86,8 @@ class FilterOptions:
 class FileOptions:
     """Which files are written besides the predictions."""
 
-    formats: Annotated[tuple[str, ...], FORMAT_NAMES] = DEFAULT_FORMATS
+    formats: Annotated[tuple[str, ...] | None, FORMAT_NAMES] = None
+    """Default: ply glb, or depth for a model without cameras."""
     filters: FilterOptions = FilterOptions()
 
     def filter_settings(self, masks: Sequence[np.ndarray] | None) -> dict[str, object]:
@@ -94,12 +96,13 @@ class FileOptions:
         del values["masks"]
         return {**values, "masks": None if masks is None else _digest(masks)}
 
-    def all_formats(self, output: OutputOptions, photos: Sequence[PhotoLike]) -> list[str]:
+    def all_formats(self, output: OutputOptions, photos: Sequence[PhotoLike], *, has_cameras: bool) -> list[str]:
         """Return the formats asked for, and those that the folder has already, unless it is overwritten.
 
-        UserError for a format that can never be written for these photos.
+        UserError for a format that can never be written for these photos, or by a model without cameras.
         """
-        asked = check_formats(self.formats, [photo.name for photo in photos])
+        formats = self.formats or (DEFAULT_FORMATS if has_cameras else FLAT_FORMATS)
+        asked = check_formats(formats, [photo.name for photo in photos], has_cameras=has_cameras)
         before = None if output.overwrite else stored_state(output.output)
         there = [] if before is None else before["settings"].get("formats", [])
         return chosen_formats([*there, *asked])

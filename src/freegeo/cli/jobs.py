@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -12,14 +13,23 @@ from typing import TYPE_CHECKING, Any
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
 from freegeo.cli.files import FileOptions, require_complete
-from freegeo.cli.options import CameraOptions, ModelOptions, OutputOptions, PlacingOptions, RecipeOptions
+from freegeo.cli.options import (
+    CameraOptions,
+    ModelOptions,
+    OutputOptions,
+    PlacingOptions,
+    RecipeOptions,
+    Refine,
+    refines_with,
+)
+from freegeo.errors import UserError
 from freegeo.export import reconstruction as npz
 from freegeo.export.base import KEPT_NAME, TRACKS_NAME
 from freegeo.export.formats import FORMATS
 from freegeo.export.photos import FOLDER as COPIES_FOLDER
 from freegeo.export.photos import write_copies
 from freegeo.files import read_json
-from freegeo.models.spec import MIXED, Mixed
+from freegeo.models.spec import MIXED, Mixed, PoseFrom
 from freegeo.progress import step_bar
 from freegeo.run_folder import check_folder, run_folder, stored_state
 
@@ -28,6 +38,8 @@ if TYPE_CHECKING:
     from freegeo.metres import ScaleSource
     from freegeo.pipeline import Hooks, Job
     from freegeo.types import PhotoLike
+
+logger = logging.getLogger(__name__)
 
 DEFAULT_FILES = FileOptions()
 NO_CAMERAS, DEFAULT_PLACING = CameraOptions(), PlacingOptions()
@@ -51,6 +63,7 @@ LABELS = {
             "keep", "room", "domain", "published", "guard",
         )
     },
+    "pose_from": "--pose-from",
 }  # fmt: skip
 """What messages call the settings of an output folder."""
 FILES = {
@@ -88,7 +101,8 @@ def run_job(
     mixed: Mixed = MIXED,
     files: FileOptions = DEFAULT_FILES,
     guard: Guard = "select",
-    refine: bool = False,
+    refine: Refine = "off",
+    pose_from: PoseFrom = "camera",
     cameras: CameraOptions = NO_CAMERAS,
     placing: PlacingOptions = DEFAULT_PLACING,
     extra_settings: dict[str, Any] | None = None,
@@ -111,17 +125,33 @@ def run_job(
         SUMMARY_NAME,
         Job,
         require_enough_photos,
+        require_pose_from,
         require_reference,
         scene_images,
     )
-    from freegeo.posed import check_known, is_one_camera, told, undistorted_masks
+    from freegeo.posed import check_known, is_one_camera, require_cameras, told, undistorted_masks
 
     check_place(output)
-    formats = files.all_formats(output, photos)
     empty = model_options.build_empty()
+    formats = files.all_formats(output, photos, has_cameras=empty.spec.cameras)
+    require_pose_from(empty.spec, pose_from)
+    refining = refines_with(cameras, refine) and empty.spec.cameras
+    if refine == "ba" and not refining:
+        raise UserError(f"{empty.spec.name} predicts no cameras, so there are none to refine. Leave --refine out.")
+    if cameras.cameras is not None or placing.scale is not None:
+        require_cameras(empty.spec)
+    if recipe is not None:
+        empty.adaptable()
     plan = None if recipe is None else recipe.build(empty.spec)
     if plan is not None:
         require_enough_photos(photos)
+        if plan.cameras and pose_from == "rays":
+            raise UserError(
+                f"recipe {plan.name} teaches the camera head, which --pose-from rays does not read. Leave out one of "
+                "them."
+            )
+    if empty.spec.caution:
+        logger.warning("%s", empty.spec.caution)
     masks = files.checked_masks(photos)
     photos, known = cameras.read(photos)
     masks = undistorted_masks(masks, photos)
@@ -145,9 +175,13 @@ def run_job(
         "command": command,
         **(extra_settings or {}),
         "adaptation": adaptation,
-        "prediction": {"reference": model_options.reference or empty.spec.reference},
+        "prediction": {
+            "reference": model_options.reference or empty.spec.reference,
+            # Only where it is not the default, so that folders of earlier versions count as finished.
+            **({} if pose_from == "camera" else {"pose_from": pose_from}),
+        },
         **placing_settings(known, scale, one_camera=one_camera),
-        "refinement": "ba" if refine else "off",
+        "refinement": "ba" if refining else "off",
         "filters": files.filter_settings(masks),
         "formats": formats,
     }
@@ -167,7 +201,7 @@ def run_job(
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), warnings=console.warned(), after=after, formats=formats, photos=photos,
             filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity, guard=guard,
-            refine=refine, known=known, priors=priors, one_camera=one_camera, scale=scale,
+            refine=refining, pose_from=pose_from, known=known, priors=priors, one_camera=one_camera, scale=scale,
             scene=None if plan is None else lambda model: scene_images("photos", photos, model, plan, batch, priors),
         )  # fmt: skip
         summary = job.run()

@@ -95,7 +95,6 @@ def describe(model: str) -> None:
     item = catalog.entry(model)
     built = catalog.build_empty(model)
     spec, (height, width) = built.spec, image_hw(built)
-    fast, small = adaptation_bytes(built)
     console.say(f"{item.name}: {item.about}")
     console.say(f"licence of the weights: {item.licence}")
     source = f"{item.hub_id}, {item.hub_file}" if item.hub_id else item.packaged_weights or "local file (--checkpoint)"
@@ -103,15 +102,23 @@ def describe(model: str) -> None:
     console.say(f"parameters: {sum(parameter.numel() for parameter in built.parameters()):,}")
     if item.hub_id:
         console.say(f"download: {_gigabytes(item.download_bytes)}")
-    console.say(
-        f"memory for {VIEWS} photos of 4:3 ({width} x {height}): {_gigabytes(reconstruction_bytes(built))} to "
-        f"reconstruct; to adapt on a GPU {_gigabytes(fast)}, or {_gigabytes(small)} where that does not fit"
-    )
+    needed = _gigabytes(reconstruction_bytes(built))
+    memory = f"memory for {VIEWS} photos of 4:3 ({width} x {height}): {needed} to reconstruct"
+    if built.cross_view is not None:
+        fast, small = adaptation_bytes(built)
+        memory += f"; to adapt on a GPU {_gigabytes(fast)}, or {_gigabytes(small)} where that does not fit"
+    console.say(memory)
     console.say(f"images: longest side {spec.default_side}, patches of {spec.patch_size}")
+    console.say(f"lengths: {'metres' if spec.metric else 'up to scale'}")
+    if spec.caution:
+        console.say(spec.caution)
+    if built.cross_view is None:
+        console.say("adapter: none, since it looks at each photo by itself")
+        return
     console.say(
         f"reference view: {spec.reference}; features compared at layers {', '.join(map(str, spec.loss_layers))}"
     )
-    console.say(f"adapter: {len(built.adaptable().adapter_targets())} linear layers and the camera token")
+    console.say(f"adapter: {len(built.adapter_targets())} linear layers and the camera token")
     console.say(
         console.table(("rank", "trainable parameters"), [(str(r), f"{count_trainable(built, r):,}") for r in RANKS])
     )
@@ -191,6 +198,8 @@ def score(
         loaded = trained_model(checkpoint)
     else:
         loaded = catalog.load_model(model, checkpoint=checkpoint)
+    if not loaded.spec.cameras:
+        raise UserError(f"{loaded.spec.name} predicts no cameras, which the report card scores. Choose another model.")
     use_few_threads(loaded)
     with progress_bar("domains", len(names)) as update:
         card = report_card(

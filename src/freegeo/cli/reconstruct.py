@@ -16,6 +16,7 @@ from freegeo.cli.options import (
     refines_with,
 )
 from freegeo.cli.sources import load_source
+from freegeo.models.spec import PoseFrom
 
 DEFAULT_MODEL, DEFAULT_PHOTOS = ModelOptions(), PhotoOptions()
 NO_CAMERAS, DEFAULT_PLACING = CameraOptions(), PlacingOptions()
@@ -31,6 +32,7 @@ def reconstruct(
     files: FileOptions = DEFAULT_FILES,
     adapter: Path | None = None,
     refine: Refine = "off",
+    pose_from: PoseFrom = "camera",
 ) -> None:
     """Reconstruct photos; one photo is enough.
 
@@ -44,10 +46,12 @@ def reconstruct(
     refine
         ba: bring the cameras to the matches between the photos by bundle adjustment, where matches that had no part in
         it then fit better (needs the extra: pip install 'freegeo[colmap]'); auto: ba where the extra is installed; off.
+    pose_from
+        camera: cameras of the model's camera head; rays: found from the rays that it predicts (any-view models of DA3).
     """
     from freegeo.adaptation.adapter_files import find_adapter
 
-    refining = refines_with(cameras, refine)
+    refines_with(cameras, refine)  # refused, where it has to be, before photos are read
     if adapter is not None:
         adapter = find_adapter(adapter)
         model = model.for_adapter(adapter)
@@ -55,5 +59,5 @@ def reconstruct(
     model.warn_of_embedded(sources)
     run_job(
         found, model, output, command="reconstruct", recipe=None, adapter=adapter, mixed=photos.mixed, files=files,
-        refine=refining, cameras=cameras, placing=placing,
+        refine=refine, pose_from=pose_from, cameras=cameras, placing=placing,
     )  # fmt: skip

@@ -16,6 +16,7 @@ from freegeo.cli.options import (
     refines_with,
 )
 from freegeo.cli.sources import load_source
+from freegeo.models.spec import PoseFrom
 
 DEFAULT_RECIPE, DEFAULT_MODEL, DEFAULT_PHOTOS = RecipeOptions(), ModelOptions(), PhotoOptions()
 NO_CAMERAS, DEFAULT_PLACING = CameraOptions(), PlacingOptions()
@@ -33,6 +34,7 @@ def run(
     adapt: bool = True,
     guard: Guard = "select",
     refine: Refine = "auto",
+    pose_from: PoseFrom = "camera",
 ) -> None:
     """Reconstruct photos with a model adapted to them.
 
@@ -50,12 +52,14 @@ def run(
     refine
         ba: bring the cameras to the matches by bundle adjustment, where matches that had no part in it then fit better
         (needs the extra: pip install 'freegeo[colmap]'); auto: ba where the extra is installed; off.
+    pose_from
+        camera: cameras of the model's camera head; rays: found from the rays that it predicts (any-view models of DA3).
     """
-    refining = refines_with(cameras, refine)
+    refines_with(cameras, refine)  # refused, where it has to be, before photos are read
     found = load_source(sources, photos)
     model.warn_of_embedded(sources)
     plan = recipe if adapt else None
     run_job(
-        found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files, guard=guard, refine=refining,
-        cameras=cameras, placing=placing,
+        found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files, guard=guard, refine=refine,
+        pose_from=pose_from, cameras=cameras, placing=placing,
     )  # fmt: skip

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 DEFAULT_FORMATS = ("ply", "glb")
+FLAT_FORMATS = ("depth",)
+"""What is written by default of a model without cameras."""
 KEPT_NAME = "kept.npz"
 """File that says which pixels became points (`freegeo.export.kept`)."""
 TRACKS_NAME = "tracks.npz"

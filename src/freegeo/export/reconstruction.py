@@ -8,7 +8,7 @@ The keys are field names and must not change, because scripts of users read them
 | `conf` | (S, H, W) | float32 | confidence, higher is better, not calibrated; 1 where the model gives none |
 | `T_cam_world` | (S, 4, 4) | float32, known ones float64 | world to camera, OpenCV axes; absent without cameras |
 | `K` | (S, 3, 3) | as above | pixels of the H x W map, centres at whole numbers; absent without cameras |
-| `sky` | (S, H, W) | float32 | probability of sky; absent when the model does not give it |
+| `sky` | (S, H, W) | float32 | 0 and more; sky from .3 on; absent when the model does not give it |
 | `images` | (S, H, W, 3) | uint8 | the images the model read |
 | `names` | (S,) | str | names of the photos |
 | `photo_hw` | (S, 2) | int64 | height and width of the photos after EXIF rotation |
@@ -57,7 +57,7 @@ class Scale:
     source: str
     """What it comes from, as it reads after "from", such as `METRIC_MODEL`."""
     spread: float | None = None
-    """Relative spread (one standard deviation) of the factors that single measurements give; None: not known."""
+    """Relative spread (standard deviation) of the factors of single measurements, such as views; None: unknown."""
 
     def __post_init__(self) -> None:
         """Raise FreeGeoError for values that no measurement gives."""
@@ -226,7 +226,7 @@ class Reconstruction:
             T_cam_world=_to_numpy(prediction.T_cam_world, trailing=3),
             K=_to_numpy(prediction.K, trailing=3),
             sky=_to_numpy(prediction.sky, trailing=3),
-            scale=None if prediction.scale is None else Scale(value=float(prediction.scale), source=METRIC_MODEL),
+            scale=_scale(prediction.scale),
             images=np.ascontiguousarray(images.cpu().numpy()),
             names=tuple(batch.names),
             photo_hw=batch.photo_hw.cpu().numpy().astype(np.int64),
@@ -347,6 +347,13 @@ def _to_numpy(tensor: Tensor | None, *, trailing: int) -> np.ndarray | None:
     if tensor.ndim != trailing:
         raise FreeGeoError(f"One reconstruction holds one scene, got a prediction of shape {tuple(tensor.shape)}.")
     return np.ascontiguousarray(tensor.detach().float().cpu().numpy())
+
+
+def _scale(scale: Tensor | None) -> Scale | None:
+    if scale is None:
+        return None
+    value, spread = scale.reshape(2).tolist()
+    return Scale(value=value, source=METRIC_MODEL, spread=None if math.isnan(spread) else spread)
 
 
 def _write(export: Export) -> list[Path]:

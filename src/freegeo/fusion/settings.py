@@ -31,8 +31,9 @@ class FilterSettings:
     """`min_agreeing` is asked only of pixels whose point falls into this many other images; 0: of all pixels."""
     tolerance: float | None = None
     """Relative depth difference of one surface in two views; None reads it off the data."""
-    sky_limit: float = 0.5
-    """Remove pixels with at least this much sky, where the model gives it; above 1 switches the filter off."""
+    sky_limit: float = 0.3
+    """Remove pixels with at least this much sky, where the model gives it; above 1 switches the filter off. The models
+    that give it fill the depth of these pixels with that of the farthest others."""
 
     def __post_init__(self) -> None:
         """Raise UserError for values outside their ranges."""

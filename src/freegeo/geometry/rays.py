@@ -36,19 +36,24 @@ def cameras_from_rays(
         generator: source of the hypotheses; the same draws serve all views.
 
     Returns:
-        ``T_cam_world`` (..., 4, 4) and ``K`` (..., 3, 3) in pixels of ``image_hw``, dtype of ``rays``.
+        ``T_cam_world`` (..., 4, 4) and ``K`` (..., 3, 3) in pixels of ``image_hw``, dtype of ``rays``; nan for a view
+        with fewer than eight usable rays, which are finite and do not run along the image plane.
 
     Raises:
-        FreeGeoError: a view has fewer than eight usable rays.
+        FreeGeoError: the maps have fewer than eight cells.
     """
-    leading, (height, width) = rays.shape[:-3], rays.shape[-3:-1]
-    # The normal matrix squares the condition number; float64 keeps the precision of a float32 map.
+    leading, (height, width), origin = rays.shape[:-3], rays.shape[-3:-1], rays
+    # The normal matrix squares the condition number; float64, which Apple GPUs lack, keeps the precision of a float32
+    # map.
+    if rays.device.type == "mps":
+        rays, confidence = rays.cpu(), confidence.cpu()
     flat = rays.reshape(-1, height * width, 6).double()
     weights = confidence.reshape(-1, height * width).double()
     grid = _normalised_grid(height, width, like=flat)
     picks = _draw_hypotheses(height * width, generator).to(rays.device)
-    usable = flat[..., 2].abs() > SMALLEST_Z
+    usable = (flat[..., 2].abs() > SMALLEST_Z) & flat.isfinite().all(-1) & weights.isfinite()
     weights = torch.where(usable, weights, 0.0)
+    flat = torch.where(usable[..., None], flat, 0.0)
     targets = flat[..., :2] / torch.where(usable, flat[..., 2], 1.0)[..., None]
     homographies = [_robust_homography(grid, *view, picks) for view in zip(targets, weights, strict=True)]
     rotation, lower = _split(torch.stack(homographies))
@@ -61,7 +66,10 @@ def cameras_from_rays(
         (1 + lower[:, 2, 0]) * half_width,
         (1 + lower[:, 2, 1]) * half_height,
     )
-    return T_cam_world.reshape(*leading, 4, 4).to(rays.dtype), K.reshape(*leading, 3, 3).to(rays.dtype)
+    # The type first: a float64 tensor cannot go to an Apple GPU.
+    found = (T_cam_world.reshape(*leading, 4, 4), K.reshape(*leading, 3, 3))
+    T_cam_world, K = (values.to(origin.dtype).to(origin.device) for values in found)
+    return T_cam_world, K
 
 
 def _normalised_grid(height: int, width: int, *, like: Tensor) -> Tensor:
@@ -85,7 +93,7 @@ def _robust_homography(grid: Tensor, target: Tensor, weight: Tensor, picks: Tens
     """Homography (3, 3), positive determinant, from grid (n, 3) to target (n, 2) with weights (n,)."""
     usable = int((weight > 0).sum())
     if usable < POINTS_PER_HYPOTHESIS:
-        raise FreeGeoError(f"A ray map has only {usable} usable rays; a pose needs at least 8. Decode the camera head.")
+        return grid.new_full((3, 3), torch.nan)
     order = weight.argsort(descending=True, stable=True)
     chosen = order[picks]
     hypotheses = _fit_homography(grid[chosen], target[chosen], weight[chosen])

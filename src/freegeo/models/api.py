@@ -17,7 +17,8 @@ from freegeo.errors import UserError
 from freegeo.models.spec import MIXED, LoadedFrom, Mixed, ModelSpec
 from freegeo.types import Features, ImageBatch, PhotoLike, Prediction, Priors, ViewTokens
 
-Want = Literal["depth", "cameras", "rays", "points"]
+Want = Literal["depth", "cameras", "ray_cameras", "rays", "points"]
+"""What `decode` can predict; `ray_cameras` are cameras found from the rays instead of those of the camera head."""
 
 
 class ReconstructionModel(nn.Module, ABC):
@@ -74,9 +75,20 @@ class ReconstructionModel(nn.Module, ABC):
     def set_recompute(self, recompute: bool) -> None:
         """Turn per-block activation checkpointing of `aggregate` on or off; a model without it keeps everything."""
 
+    @property
+    def cross_view(self) -> ReconstructionModel | None:
+        """The part with the cross-view layers, which an adapter belongs to; None for a model of single views."""
+        return self
+
     def adaptable(self) -> ReconstructionModel:
         """Return the part that an adapter belongs to; UserError for a model without cross-view layers."""
-        return self
+        part = self.cross_view
+        if part is None:
+            raise UserError(
+                f"{self.spec.name} looks at each photo by itself: it has no cross-view layers, which adaptation works "
+                "on. Reconstruct without adapting (--no-adapt, or `freegeo reconstruct`), or use another model."
+            )
+        return part
 
 
 def check_layers(layers: Collection[int], depth: int, model: str) -> None:

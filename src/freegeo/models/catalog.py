@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,8 +27,8 @@ PLUGIN_GROUP = "freegeo.models"
 
 def names() -> list[str]:
     """Return the names of all models that can be used: our own, then those of installed plug-ins."""
-    own = [name for name, item in _own_entries().items() if item.build is not None]
-    return own + sorted(set(_plugin_points()) - set(_own_entries()))
+    own = _own_entries()
+    return [*own, *sorted(set(_plugin_points()) - set(own))]
 
 
 def entry(name: str) -> ModelEntry:
@@ -64,7 +63,7 @@ def build_empty(name: str) -> ReconstructionModel:
     """Build a model on the meta device: shapes and counts, no memory."""
     from freegeo.models.checkpoints import build_on_meta
 
-    return build_on_meta(_buildable(name))
+    return build_on_meta(entry(name).build)
 
 
 def load_model(name: str = DEFAULT_MODEL, *, checkpoint: str | Path | None = None) -> ReconstructionModel:
@@ -76,9 +75,8 @@ def load_model(name: str = DEFAULT_MODEL, *, checkpoint: str | Path | None = Non
     from freegeo.models import checkpoints
 
     item = entry(name)
-    build = _buildable(name)
     path = weights_file(name, checkpoint)
-    model = checkpoints.build_on_meta(build)
+    model = checkpoints.build_on_meta(item.build)
     try:
         checkpoints.load_weights(model, path, item.keys, item.name)
     except UserError as error:
@@ -108,7 +106,6 @@ def download(name: str, *, check_hash: bool = False) -> Path:
     `check_hash` reads the whole of a file that is there already; without it, its length is checked.
     """
     item = entry(name)
-    _buildable(name)
     if item.packaged_weights is not None:
         return item.packaged_weights
     if item.hub_id is None:
@@ -124,13 +121,6 @@ def _packaged_or_downloaded(item: ModelEntry) -> Path:
     if not item.packaged_weights.is_file():
         raise FreeGeoError(f"{item.packaged_weights}: the weights of {item.name} are missing. Reinstall the package.")
     return item.packaged_weights
-
-
-def _buildable(name: str) -> Callable[[], ReconstructionModel]:
-    item = entry(name)
-    if item.build is None:
-        raise UserError(f"{item.name} is not implemented: {item.about}")
-    return item.build
 
 
 def _own_entries() -> dict[str, ModelEntry]:

@@ -1,5 +1,7 @@
 """Depth Anything 3, any-view models (docs/models/da3.md, "Stages" and what follows); variants are in da3_config.py.
 
+Those of single views, and the nested one, are in da3_metric.py.
+
 Per-view blocks, then alternating per-view and global blocks; a dual dense head for depth and rays; a camera decoder,
 and a camera encoder for known poses. Modules carry the official key names without the prefix `model.`.
 
@@ -17,6 +19,7 @@ from torch import Tensor, nn
 
 from freegeo.errors import UserError
 from freegeo.geometry.camera import decode_camera_to_world, encode_camera_to_world
+from freegeo.geometry.rays import cameras_from_rays
 from freegeo.geometry.se3 import normalise_poses
 from freegeo.models import da3_images, reference
 from freegeo.models.api import ReconstructionModel, Want, check_layers, check_want, level_tokens
@@ -38,6 +41,8 @@ from freegeo.models.transformer import (
 from freegeo.types import Features, ImageBatch, Prediction, Priors, ViewTokens
 
 SELECTION = "selection"
+RAY_SEED = 0
+"""Seed of the hypotheses in the search for cameras of rays."""
 
 
 class Backbone(nn.Module):
@@ -49,7 +54,8 @@ class Backbone(nn.Module):
         width, tokens = config.width, config.position_grid**2 + 1
         self.patch_embed = PatchEmbed(config.patch_size, width)
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
-        self.camera_token = nn.Parameter(torch.zeros(1, 2, width))
+        if config.cross_view:
+            self.camera_token = nn.Parameter(torch.zeros(1, 2, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, tokens, width))
         self.blocks = nn.ModuleList(
             Block(width, config.heads, qk_norm=i >= config.qknorm_start, norm_eps=1e-6, ffn=config.ffn)
@@ -73,7 +79,7 @@ class Backbone(nn.Module):
             x = self._run(i, x, grid_hw)
             if i in keep:
                 extra[f"layer.{i}"] = x
-            if i == self.config.alt_start - 2:
+            if self.config.cross_view and i == self.config.alt_start - 2:
                 extra[SELECTION] = x[:, 0]
         return x, extra
 
@@ -89,6 +95,8 @@ class Backbone(nn.Module):
         `order` (B, S) lists the views with the reference first; None keeps the input order.
         """
         levels = {i: self._early_level(tokens, i) for i in layers if i < self.config.alt_start}
+        if not self.config.cross_view:
+            return levels
         x_BSND = tokens.tokens if order is None else reference.take_views(tokens.tokens, order)
         x_BSND = torch.cat([self._first_tokens(x_BSND, camera_tokens_BSD), x_BSND[:, :, 1:]], dim=2)
         local_BSND = x_BSND
@@ -167,47 +175,17 @@ class CameraEncoder(nn.Module):
         return self.trunk_norm(self.trunk(self.token_norm(self.pose_branch(encoding_BS9))))
 
 
-class DA3(ReconstructionModel):
-    """Depth Anything 3 for any number of views."""
-
-    published_adapter_root = "backbone.pretrained"
+class DA3Images(ReconstructionModel):
+    """What any-view and single-view models have in common: images, and the per-view blocks on them."""
 
     def __init__(self, config: DA3Config, spec: ModelSpec):
         super().__init__()
         self.config, self.spec = config, spec
         self.backbone = nn.ModuleDict({"pretrained": Backbone(config)})
-        self.head = DenseHead(
-            channels_in=config.channels,
-            features=config.head_features,
-            out_channels=config.head_channels,
-            outputs=2,
-            patch_size=config.patch_size,
-            ray_branch=True,
-        )
-        self.cam_enc = CameraEncoder(config.width, config.camera_encoder_depth, config.camera_encoder_heads)
-        self.cam_dec = CameraDecoder(config.channels)
 
     @property
     def _vit(self) -> Backbone:
         return cast(Backbone, self.backbone["pretrained"])
-
-    @property
-    def camera_token_name(self) -> str:
-        """Name of the two learned tokens: reference view, other views."""
-        return "backbone.pretrained.camera_token"
-
-    def set_recompute(self, recompute: bool) -> None:
-        """Turn per-block activation checkpointing on or off."""
-        self._vit.recompute = recompute
-
-    def adapter_targets(self) -> list[str]:
-        """Return all linears of the blocks from alt_start on."""
-        return [
-            name
-            for i, block in enumerate(self._vit.blocks)
-            if i >= self.config.alt_start
-            for name in block_linears(f"backbone.pretrained.blocks.{i}", block)
-        ]
 
     def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED) -> ImageBatch:
         """Resize to the default longest side, then to the nearest multiples of the patch."""
@@ -226,6 +204,43 @@ class DA3(ReconstructionModel):
             image_hw=(images.shape[-2], images.shape[-1]),
             grid_hw=patch_grid(images, self.config.patch_size),
         )
+
+
+class DA3(DA3Images):
+    """Depth Anything 3 for any number of views."""
+
+    published_adapter_root = "backbone.pretrained"
+
+    def __init__(self, config: DA3Config, spec: ModelSpec):
+        super().__init__(config, spec)
+        self.head = DenseHead(
+            channels_in=config.channels,
+            features=config.head_features,
+            out_channels=config.head_channels,
+            outputs=2,
+            patch_size=config.patch_size,
+            ray_branch=True,
+        )
+        self.cam_enc = CameraEncoder(config.width, config.camera_encoder_depth, config.camera_encoder_heads)
+        self.cam_dec = CameraDecoder(config.channels)
+
+    @property
+    def camera_token_name(self) -> str:
+        """Name of the two learned tokens: reference view, other views."""
+        return "backbone.pretrained.camera_token"
+
+    def set_recompute(self, recompute: bool) -> None:
+        """Turn per-block activation checkpointing on or off."""
+        self._vit.recompute = recompute
+
+    def adapter_targets(self) -> list[str]:
+        """Return all linears of the blocks from alt_start on."""
+        return [
+            name
+            for i, block in enumerate(self._vit.blocks)
+            if i >= self.config.alt_start
+            for name in block_linears(f"backbone.pretrained.blocks.{i}", block)
+        ]
 
     def aggregate(
         self,
@@ -267,14 +282,22 @@ class DA3(ReconstructionModel):
             return self.cam_enc(encode_camera_to_world(T_cam_world, K, image_hw))
 
     def decode(self, features: Features, *, want: Collection[Want] = ("depth", "cameras")) -> Prediction:
-        """Read out depth, confidence, cameras and (only if in `want`) rays, in float32."""
-        check_want(want, ("depth", "cameras", "rays"), self.spec.name)
+        """Read out depth, confidence, cameras and (only if in `want`) rays or the cameras of rays, in float32."""
+        check_want(want, ("depth", "cameras", "ray_cameras", "rays"), self.spec.name)
+        if {"cameras", "ray_cameras"} <= set(want):
+            raise UserError("cameras come from the camera head or from the rays. Ask for one of both.")
         maps: dict[str, Tensor] = {}
         with torch.autocast(next(iter(features.levels.values()))[0].device.type, enabled=False):
-            if "depth" in want or "rays" in want:
+            if {"depth", "rays", "ray_cameras"} & set(want):
                 maps |= self._dense(features, want)
             if "cameras" in want:
                 maps |= self._cameras(features)
+            if "ray_cameras" in want:
+                rays = maps["rays"] if "rays" in want else maps.pop("rays")
+                # The same draws in every call, so that equal features give equal cameras.
+                drawn = torch.Generator().manual_seed(RAY_SEED)
+                found = cameras_from_rays(rays[..., :6], rays[..., 6], features.image_hw, generator=drawn)
+                maps |= dict(zip(("T_cam_world", "K"), found, strict=True))
         return Prediction(**maps)
 
     def _cameras(self, features: Features) -> dict[str, Tensor]:
@@ -292,7 +315,7 @@ class DA3(ReconstructionModel):
         maps = {}
         if "depth" in want:
             maps |= depth_maps(self.head.dense(pyramid, grid_hw))
-        if "rays" in want:
+        if {"rays", "ray_cameras"} & set(want):
             directions_origins, conf = self.head.rays(pyramid, grid_hw).split([6, 1], dim=1)
             maps["rays"] = torch.cat([directions_origins, confidence(conf)], dim=1).permute(0, 2, 3, 1)
         return maps

@@ -1,6 +1,6 @@
 """The DA3 variants: the published ones (docs/models/da3.md, "Variants"), and the embedded model as one more.
 
-The architecture itself is in da3.py. Importing this file does not import torch.
+The architecture itself is in da3.py and da3_metric.py. Importing this file does not import torch.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from freegeo.models.spec import AdaptationDefaults, KeyRules, ModelEntry, ModelS
 
 if TYPE_CHECKING:
     from freegeo.models.da3 import DA3
+    from freegeo.models.da3_metric import DA3Nested, DA3SingleView
 
 APACHE = "Apache-2.0"
 NON_COMMERCIAL = "CC BY-NC 4.0 (non-commercial)"
@@ -34,7 +35,8 @@ class DA3Config:
     ffn: Literal["mlp", "swiglu"] = "mlp"
     """Feed-forward layer of a block."""
     alt_start: int
-    """First block that comes after the views were given their camera token; odd blocks from here on are global."""
+    """First block that comes after the views were given their camera token; odd blocks from here on are global.
+    `depth` for a model of single views, which has no such blocks."""
     qknorm_start: int
     """First block that normalises queries and keys."""
     rope_start: int
@@ -61,6 +63,11 @@ class DA3Config:
             raise ValueError(f"out_layers must ascend, got {self.out_layers}")
 
     @property
+    def cross_view(self) -> bool:
+        """Whether views see each other."""
+        return self.alt_start < self.depth
+
+    @property
     def channels(self) -> int:
         """Feature channels per token, C."""
         return self.width * (2 if self.cat_token else 1)
@@ -81,6 +88,10 @@ LARGE = DA3Config(
 GIANT = DA3Config(
     width=1536, depth=40, heads=24, ffn="swiglu", alt_start=13, qknorm_start=13, rope_start=13,
     out_layers=(19, 27, 33, 39), head_features=256, head_channels=(256, 512, 1024, 1024),
+)  # fmt: skip
+SINGLE_VIEW = DA3Config(
+    width=1024, depth=24, heads=16, alt_start=24, qknorm_start=24, rope_start=24, out_layers=(4, 11, 17, 23),
+    head_features=256, head_channels=(256, 512, 1024, 1024), cat_token=False,
 )  # fmt: skip
 EMBEDDED = DA3Config(
     width=128, depth=10, heads=4, alt_start=3, qknorm_start=3, rope_start=3, out_layers=(3, 5, 7, 9),
@@ -103,15 +114,45 @@ KEYS = KeyRules(
 """Official checkpoints: a prefix, a Gaussian head that is left out, and one norm that is shared by four layers."""
 
 
+SINGLE_VIEW_KEYS = KeyRules(prefix="model.")
+NESTED_KEYS = KeyRules(
+    prefix="model.",
+    skipped=tuple(f"da3.{name}" for name in KEYS.skipped),
+    aliases={f"da3.{alias}": f"da3.{stored}" for alias, stored in KEYS.aliases.items()},
+)
+
+
 def build(config: DA3Config, spec: ModelSpec) -> DA3:
-    """Build a variant without weights."""
+    """Build an any-view variant without weights."""
     from freegeo.models.da3 import DA3
 
     return DA3(config, spec)
 
 
-def _published(name: str, config: DA3Config, licence: str, parameters: int, hub_id: str) -> ModelEntry:
-    spec = ModelSpec(
+def build_single_view(config: DA3Config, spec: ModelSpec) -> DA3SingleView:
+    """Build a variant of single views without weights."""
+    from freegeo.models.da3_metric import DA3SingleView
+
+    return DA3SingleView(config, spec)
+
+
+def build_nested(anyview: DA3Config, metric: DA3Config, spec: ModelSpec) -> DA3Nested:
+    """Build a nested variant without weights."""
+    from freegeo.models.da3_metric import DA3Nested
+
+    return DA3Nested(anyview, metric, spec)
+
+
+def _spec(
+    name: str,
+    config: DA3Config,
+    licence: str,
+    *,
+    cameras: bool = True,
+    metric: bool = False,
+    caution: str | None = None,
+) -> ModelSpec:
+    return ModelSpec(
         name=name,
         patch_size=config.patch_size,
         default_side=504,
@@ -120,22 +161,49 @@ def _published(name: str, config: DA3Config, licence: str, parameters: int, hub_
         special_tokens=1,
         weights_licence=licence,
         adaptation=AdaptationDefaults(temperature=10.0, scene_lr=3e-5, published="da3"),
-        takes="cameras",
+        cameras=cameras,
+        metric=metric,
+        ray_cameras=cameras,
+        caution=caution,
+        takes="cameras" if cameras else "nothing",
     )
+
+
+def _published(name: str, config: DA3Config, licence: str, parameters: int, hub_id: str) -> ModelEntry:
     return ModelEntry(
         name=name,
         about=f"any number of views, {config.depth} blocks of width {config.width}",
         licence=licence,
         parameters=parameters,
-        build=partial(build, config, spec),
+        build=partial(build, config, _spec(name, config, licence)),
         keys=KEYS,
         hub_id=f"depth-anything/{hub_id}",
     )
 
 
-def _later(name: str, licence: str, parameters: int, hub_id: str, what: str) -> ModelEntry:
-    about = f"{what}; use da3-small, da3-base, da3-large or da3-giant."
-    return ModelEntry(name=name, about=about, licence=licence, parameters=parameters, hub_id=f"depth-anything/{hub_id}")
+def _single_view(name: str, hub_id: str, about: str, caution: str | None = None) -> ModelEntry:
+    return ModelEntry(
+        name=name,
+        about=about,
+        licence=APACHE,
+        parameters=334_171_394,
+        build=partial(build_single_view, SINGLE_VIEW, _spec(name, SINGLE_VIEW, APACHE, cameras=False, caution=caution)),
+        keys=SINGLE_VIEW_KEYS,
+        hub_id=f"depth-anything/{hub_id}",
+    )
+
+
+def _nested(name: str, parameters: int, hub_id: str) -> ModelEntry:
+    spec = _spec(name, GIANT, NON_COMMERCIAL, metric=True)
+    return ModelEntry(
+        name=name,
+        about="da3-giant with lengths in metres, and sky",
+        licence=NON_COMMERCIAL,
+        parameters=parameters,
+        build=partial(build_nested, GIANT, SINGLE_VIEW, spec),
+        keys=NESTED_KEYS,
+        hub_id=f"depth-anything/{hub_id}",
+    )
 
 
 def embedded_spec(config: DA3Config) -> ModelSpec:
@@ -149,6 +217,7 @@ def embedded_spec(config: DA3Config) -> ModelSpec:
         special_tokens=1,
         weights_licence=APACHE,
         adaptation=AdaptationDefaults(temperature=2.5, scene_lr=1e-3, rank=16, neighbours=True),
+        ray_cameras=True,
         takes="cameras",
     )
 
@@ -170,10 +239,14 @@ ENTRIES = (
     _published("da3-base", BASE, APACHE, 135_366_599, "DA3-BASE"),
     _published("da3-large", LARGE, NON_COMMERCIAL, 410_941_767, "DA3-LARGE-1.1"),
     _published("da3-giant", GIANT, NON_COMMERCIAL, 1_355_674_125, "DA3-GIANT-1.1"),
-    _later("da3mono-large", APACHE, 334_171_394, "DA3MONO-LARGE", "one view at a time, no cameras"),
-    _later("da3metric-large", APACHE, 334_171_394, "DA3METRIC-LARGE", "one view at a time, metric depth"),
-    _later(
-        "da3nested-giant-large", NON_COMMERCIAL, 1_689_845_519, "DA3NESTED-GIANT-LARGE-1.1", "giant with metric scale"
+    _nested("da3nested-giant-large", 1_689_845_519, "DA3NESTED-GIANT-LARGE-1.1"),
+    _single_view("da3mono-large", "DA3MONO-LARGE", "depth and sky of single photos, no cameras; cannot be adapted"),
+    _single_view(
+        "da3metric-large",
+        "DA3METRIC-LARGE",
+        "depth and sky of single photos, in metres times 300 / focal length; cannot be adapted",
+        caution="da3metric-large does not know the focal length, so its depth is not in metres yet: multiply it by the "
+        "focal length in pixels of the model's image / 300, or use da3nested-giant-large, which does that by itself.",
     ),
     _embedded(),
 )

@@ -108,7 +108,14 @@ class Scratch(nn.Module):
     """The fusion chain and the read-outs, under their official names."""
 
     def __init__(
-        self, features: int, out_channels: Sequence[int], outputs: int, *, rectified_skip: bool, ray_branch: bool
+        self,
+        features: int,
+        out_channels: Sequence[int],
+        outputs: int,
+        *,
+        rectified_skip: bool,
+        ray_branch: bool,
+        sky_branch: bool,
     ):
         super().__init__()
         for k, channels in enumerate(out_channels, start=1):
@@ -118,6 +125,8 @@ class Scratch(nn.Module):
                 self.add_module(f"refinenet{k}{suffix}", fusion)
         self.output_conv1 = nn.Conv2d(features, features // 2, 3, padding=1)
         self.output_conv2 = read_out(features, outputs)
+        if sky_branch:
+            self.sky_output_conv2 = read_out(features, 1)
         if ray_branch:
             self.output_conv1_aux = nn.ModuleList(self._ray_trunk(features) for _ in range(4))
             # One norm module is shared by all four read-outs; the checkpoint stores it once, under level 0.
@@ -145,7 +154,10 @@ class Scratch(nn.Module):
 
 
 class DenseHead(nn.Module):
-    """Dense read-out of four feature levels; views are independent of each other."""
+    """Dense read-out of four feature levels; views are independent of each other.
+
+    The head of DA3's single-view models (`single_view`) has no norm and no position embedding, but a sky branch.
+    """
 
     def __init__(
         self,
@@ -157,10 +169,11 @@ class DenseHead(nn.Module):
         patch_size: int,
         rectified_skip: bool = False,
         ray_branch: bool = False,
+        single_view: bool = False,
     ):
         super().__init__()
-        self.patch_size = patch_size
-        self.norm = nn.LayerNorm(channels_in, eps=1e-5)
+        self.patch_size, self.single_view = patch_size, single_view
+        self.norm = nn.Identity() if single_view else nn.LayerNorm(channels_in, eps=1e-5)
         self.projects = nn.ModuleList(nn.Conv2d(channels_in, channels, 1) for channels in out_channels)
         oc0, oc1, _, oc3 = out_channels
         self.resize_layers = nn.ModuleList(
@@ -171,7 +184,10 @@ class DenseHead(nn.Module):
                 nn.Conv2d(oc3, oc3, 3, stride=2, padding=1),
             ]
         )
-        self.scratch = Scratch(features, out_channels, outputs, rectified_skip=rectified_skip, ray_branch=ray_branch)
+        self.scratch = Scratch(
+            features, out_channels, outputs, rectified_skip=rectified_skip, ray_branch=ray_branch,
+            sky_branch=single_view,
+        )  # fmt: skip
 
     def pyramid(self, levels_VPC: Sequence[Tensor], grid_hw: tuple[int, int]) -> list[Tensor]:
         """Turn four token maps into four maps of F channels at 4, 2, 1 and 1/2 of the patch grid."""
@@ -181,14 +197,19 @@ class DenseHead(nn.Module):
             zip(levels_VPC, self.projects, self.resize_layers, strict=True), start=1
         ):
             x = project(self.norm(tokens).transpose(1, 2).unflatten(2, grid_hw))
-            maps.append(getattr(self.scratch, f"layer{k}_rn")(scale(add_uv(x, aspect))))
+            maps.append(getattr(self.scratch, f"layer{k}_rn")(scale(self._placed(x, aspect))))
         return maps
 
+    def _placed(self, x_VCHW: Tensor, aspect: float) -> Tensor:
+        return x_VCHW if self.single_view else add_uv(x_VCHW, aspect)
+
     def dense(self, pyramid: Sequence[Tensor], grid_hw: tuple[int, int]) -> Tensor:
-        """Read the main branch at image resolution: (V, outputs, H, W), no activation."""
+        """Read the main branch at image resolution: (V, outputs, H, W), no activation; then sky, if there is any."""
         x = self.scratch.output_conv1(self.scratch.fuse(pyramid))
         x = resize(x, [n * self.patch_size for n in grid_hw])
-        return self.scratch.output_conv2(add_uv(x, grid_hw[1] / grid_hw[0]))
+        x = self._placed(x, grid_hw[1] / grid_hw[0])
+        main = self.scratch.output_conv2(x)
+        return torch.cat([main, self.scratch.sky_output_conv2(x)], dim=1) if self.single_view else main
 
     def rays(self, pyramid: Sequence[Tensor], grid_hw: tuple[int, int]) -> Tensor:
         """Read the ray branch at 8 samples a patch: (V, 7, 8h, 8w), no activation."""

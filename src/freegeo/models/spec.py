@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from freegeo.models.api import ReconstructionModel
 
+PoseFrom = Literal["camera", "rays"]
+"""Where a model's cameras come from: its camera head, or the rays that it predicts for every pixel."""
 Mixed = Literal["crop", "pad", "upstream"]
 """How photos of different shapes become images of one size; the network sees all views in one pass.
 
@@ -57,6 +59,14 @@ class ModelSpec:
     """Tokens of a view that are no patches."""
     weights_licence: str
     adaptation: AdaptationDefaults
+    cameras: bool = True
+    """Whether it predicts cameras; without them a result is depth alone."""
+    metric: bool = False
+    """Whether its lengths are metres."""
+    ray_cameras: bool = False
+    """Whether it can also find cameras from a ray map."""
+    caution: str | None = None
+    """A sentence on its results that everyone who uses it has to read."""
     takes: Takes = "nothing"
     """What the model can be told of its views (`freegeo.types.Priors`)."""
 
@@ -86,8 +96,8 @@ class ModelEntry:
     licence: str
     """Licence of the weights."""
     parameters: int
-    build: Callable[[], ReconstructionModel] | None = None
-    """Builds the model without weights; None: listed, but not implemented."""
+    build: Callable[[], ReconstructionModel]
+    """Builds the model without weights."""
     keys: KeyRules = KeyRules()
     """Rules that translate the checkpoint's names; by default the names are the model's own."""
     hub_id: str | None = None
