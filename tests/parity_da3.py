@@ -22,7 +22,7 @@ from freegeo.models.da3_config import KEYS, SINGLE_VIEW_KEYS, DA3Config
 from freegeo.models.da3_metric import METRIC_DEPTH, METRIC_SKY, DA3Nested, DA3SingleView, fill_sky
 from freegeo.models.images import IMAGE_MEAN, IMAGE_STD
 from freegeo.models.spec import AdaptationDefaults, ModelSpec
-from freegeo.types import Cameras, Features, Prediction, ViewTokens
+from freegeo.types import Features, Prediction, ViewTokens
 from parity_da3_functions import FUNCTIONS
 
 NETWORK = 1e-4
@@ -100,6 +100,7 @@ def small_config(folder: Path) -> tuple[DA3Config, ModelSpec]:
     spec = ModelSpec(
         name=folder.name, patch_size=14, default_side=504, loss_layers=config.out_layers, reference="saddle_balanced",
         special_tokens=1, weights_licence="none", adaptation=AdaptationDefaults(temperature=10.0, scene_lr=3e-5),
+        takes="cameras",
     )  # fmt: skip
     return config, spec
 
@@ -109,22 +110,30 @@ def check_network(folder: Path, case: dict) -> float:
     """Compare tokens, features, cameras and dense maps; the reference view must be the recorded one."""
     model, wanted = build(folder), read_tensors(folder / case["file"])
     tokens = model.embed(images_of(wanted))
-    cameras = None
+    known = None
     if "extrinsics_in" in wanted:
-        cameras = Cameras(T_cam_world=to_4x4(wanted["extrinsics_in"]), K=wanted["intrinsics_in"])
-    features = model.aggregate(tokens, reference=case["ref_view_strategy"], cameras=cameras)
+        # The recorded network takes poses as they come; normalising them was left to its callers.
+        known = model.encode_cameras(to_4x4(wanted["extrinsics_in"]), wanted["intrinsics_in"], tokens.image_hw)
+    features = aggregated(model, tokens, case, known)
     ours = found_tensors(model, tokens, features, model.decode(features, want=("depth", "cameras", "rays")))
-    if cameras is not None:
-        ours["cam_enc"] = model.encode_cameras(cameras, tokens.image_hw)
+    if known is not None:
+        ours["cam_enc"] = known
     if "ref_idx" in wanted:
         order = model.view_order(tokens, case["ref_view_strategy"])
         chosen = torch.zeros_like(wanted["ref_idx"]) if order is None else order[:, 0]
         if not torch.equal(chosen, wanted["ref_idx"]):
             return math.inf
-    ours |= block_outputs(model, tokens, case, cameras, wanted)
+    ours |= block_outputs(model, tokens, case, known, wanted)
     compared = [name for name in wanted if name in ours]
     assert {"depth", "extrinsics", "intrinsics", "pose_enc"} <= set(compared)
     return max(relative_error(ours[name], wanted[name]) for name in compared) / NETWORK
+
+
+def aggregated(model: DA3, tokens: ViewTokens, case: dict, known: Tensor | None) -> Features:
+    """Aggregate as the case says, with the camera tokens of known cameras or the learned ones."""
+    if known is None:
+        return model.aggregate(tokens, reference=case["ref_view_strategy"])
+    return model.mix(tokens, model.config.out_layers, None, known)
 
 
 @torch.no_grad()
@@ -192,9 +201,7 @@ def found_tensors(model: DA3, tokens: ViewTokens, features: Features, prediction
     return named
 
 
-def block_outputs(
-    model: DA3, tokens: ViewTokens, case: dict, cameras: Cameras | None, wanted: dict
-) -> dict[str, Tensor]:
+def block_outputs(model: DA3, tokens: ViewTokens, case: dict, known: Tensor | None, wanted: dict) -> dict[str, Tensor]:
     """Record the output of every block in the internal view order, as the recordings have it."""
     seen: dict[str, Tensor] = {}
     shape = tokens.tokens.shape
@@ -202,10 +209,10 @@ def block_outputs(
         block.register_forward_hook(lambda _m, _i, out, i=i: seen.__setitem__(f"block.{i}", out.reshape(shape)))
         for i, block in enumerate(model.backbone["pretrained"].blocks)
     ]
-    model.aggregate(model.embed(images_of(wanted)), reference=case["ref_view_strategy"], cameras=cameras)
+    aggregated(model, model.embed(images_of(wanted)), case, known)
     for hook in hooks:
         hook.remove()
-    order = None if cameras is not None else model.view_order(tokens, case["ref_view_strategy"])
+    order = None if known is not None else model.view_order(tokens, case["ref_view_strategy"])
     early = model.config.alt_start - 1
     if order is not None and f"block.{early}" in seen:
         seen[f"block.{early}"] = reference.take_views(seen[f"block.{early}"], order)

@@ -11,8 +11,10 @@ ANYWHERE = {"types", "errors", "files", "run_folder", "__init__"}
 ALLOWED = {
     "pipeline": {
         *("models", "data", "adaptation", "evidence", "fusion", "export", "report", "metrics", "geometry", "progress"),
-        *("guarded", "refined", "taught"),
+        *("guarded", "refined", "taught", "posed", "metres", "cameras"),
     },
+    "posed": {"cameras", "data", "evidence", "export", "geometry", "models"},
+    "metres": {"cameras", "data", "export", "geometry"},
     "guarded": {"adaptation", "evidence", "export"},
     "refined": {"data", "evidence", "export", "fusion", "guarded", "models"},
     "taught": {"adaptation", "evidence", "export", "geometry", "guarded"},

@@ -21,13 +21,12 @@ from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.guard import Reference
 from freegeo.evidence.scores import epipolar, reprojection
 from freegeo.fusion.tsdf import TsdfVolume
-from freegeo.geometry.se3 import normalise_poses
 from freegeo.models.api import embed_in_chunks
 from freegeo.models.precision import Compute
 from freegeo.pipeline import predict
 from freegeo.training.config import TrainConfig
 from freegeo.training.loop import train
-from freegeo.types import Cameras, ImageBatch
+from freegeo.types import ImageBatch, Priors
 from pretend_device import MixedDevicesError, NoFloat64Error, PretendDevice
 from tiny_models import noise, noise_scene, quick, tensors, tiny_da3, tiny_nested, tiny_vggt
 
@@ -138,8 +137,8 @@ def test_a_prediction_stays_on_its_device(make, device):
         model = make().to(device)
         tokens, found = predicted(model, pretend.device)
         if make is tiny_da3:
-            cameras = Cameras(T_cam_world=normalise_poses(found.T_cam_world), K=found.K)
-            model.aggregate(tokens, cameras=cameras)
+            priors = Priors(T_cam_world=found.T_cam_world.cpu(), K=found.K.cpu())
+            model.aggregate(tokens, priors=priors)
         pretend.waits.clear()
         features = model.aggregate(tokens, reference=rule)
         assert not pretend.waits

@@ -76,6 +76,14 @@ def test_programs_of_the_python_page_run(photo_folder, capsys):
     assert names["exported"].failed == {}
 
 
+def test_program_of_the_page_on_scale_runs(photo_folder, capsys):
+    (program,) = programs("docs/scale.md")
+    names: dict = {}
+    exec(compile(program, "docs/scale.md", "exec"), names)
+    assert re.search(r"Scale\(value=.+, source='a measured distance', spread=None\)", capsys.readouterr().out)
+    assert np.ptp(names["shared"].K[:, 0, 0]) == 0
+
+
 @pytest.mark.parametrize("link", sorted(set(re.findall(r"\]\(([^)#:]+)\)", (ROOT / "README.md").read_text()))))
 def test_links_lead_somewhere(link):
     assert (ROOT / link).exists()

@@ -28,7 +28,9 @@ SINGLE_VIEW = replace(ANY_VIEW, alt_start=6, qknorm_start=6, rope_start=6, cat_t
 
 def tiny_da3(seed: int = 0, ffn: str = "mlp", name: str = "tiny-da3") -> DA3:
     """Two per-view blocks and four cross-view ones, width 32."""
-    return randomise(DA3(replace(ANY_VIEW, ffn=ffn), _spec(name, ANY_VIEW.out_layers, special=1)), seed)
+    return randomise(
+        DA3(replace(ANY_VIEW, ffn=ffn), _spec(name, ANY_VIEW.out_layers, special=1, takes="cameras")), seed
+    )
 
 
 def tiny_single_view(seed: int = 0, name: str = "tiny-single-view") -> DA3SingleView:
@@ -38,7 +40,7 @@ def tiny_single_view(seed: int = 0, name: str = "tiny-single-view") -> DA3Single
 
 def tiny_nested(seed: int = 0, name: str = "tiny-nested") -> DA3Nested:
     """The tiny any-view model beside the tiny single-view one."""
-    spec = _spec(name, ANY_VIEW.out_layers, special=1, metric=True, ray_cameras=True)
+    spec = _spec(name, ANY_VIEW.out_layers, special=1, metric=True, ray_cameras=True, takes="cameras")
     return randomise(DA3Nested(ANY_VIEW, SINGLE_VIEW, spec), seed)
 
 
@@ -113,7 +115,7 @@ def trained(model: ReconstructionModel, seed: int = 1) -> Adapter:
     return adapter
 
 
-def _spec(name: str, layers: tuple[int, ...], special: int, **more: bool) -> ModelSpec:
+def _spec(name: str, layers: tuple[int, ...], special: int, **more) -> ModelSpec:
     return ModelSpec(
         name=name, patch_size=PATCH, default_side=4 * PATCH, loss_layers=layers, reference="first",
         special_tokens=special, weights_licence="none", adaptation=DEFAULTS, **more,

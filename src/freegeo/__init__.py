@@ -13,6 +13,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "load_model": "freegeo.models.catalog",
     "load_photos": "freegeo.data.photos",
+    "read_cameras": "freegeo.cameras.reading",
     "adapt": "freegeo.pipeline",
     "reconstruct": "freegeo.pipeline",
     "refine": "freegeo.refined",

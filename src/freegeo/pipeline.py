@@ -44,20 +44,32 @@ from freegeo.files import FORMAT, as_json, read_json, remove_written, write_json
 from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
 from freegeo.guarded import Evidence, harm, judge_adapter
+from freegeo.metres import ScaleSource, in_metres, read_scale
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import EMBEDDED_MODEL, warn_of_embedded_model
 from freegeo.models.images import read_photos
 from freegeo.models.precision import Compute
 from freegeo.models.spec import MIXED, Mixed, ModelSpec, PoseFrom
+from freegeo.posed import (
+    check_known,
+    is_one_camera,
+    known_cameras,
+    require_cameras,
+    told,
+    with_known_cameras,
+    with_one_camera,
+)
 from freegeo.progress import step_bar
 from freegeo.refined import refine_by_photos
 from freegeo.report.page import write_report
 from freegeo.run_folder import Part, RunFolder
 from freegeo.taught import lesson
-from freegeo.types import ImageBatch, PhotoLike
+from freegeo.types import ImageBatch, PhotoLike, Priors
 
 if TYPE_CHECKING:
+    from freegeo.cameras.known import KnownCameras
     from freegeo.data.photos import PhotoSource
+    from freegeo.fusion.tracks import Tracks
 
 logger = logging.getLogger(__name__)
 
@@ -66,21 +78,25 @@ FROZEN_FOLDER = "frozen"
 FILES_STAGE = "points and files"
 MATCHES_NAME = "matches.npz"
 UNREFINED_FOLDER = "unrefined"
-"""Holds the model's prediction where the result is a refined one, unless that is the frozen one of `FROZEN_FOLDER`."""
+"""Holds what was refined where the result is a refined one, unless that is the frozen prediction."""
+PREDICTED_FOLDER = "predicted"
+"""Holds the model's prediction where known or shared cameras, or a scale, make another result of it, unless that is the
+frozen one of `FROZEN_FOLDER`."""
 ADAPTATION = Part("adaptation", (f"{ADAPTER_FOLDER}/", MATCHES_NAME))
 PREDICTION = Part(
     "prediction",
     (
         f"{FROZEN_FOLDER}/{PREDICTION_NAME}", PREDICTION_NAME, f"{UNREFINED_FOLDER}/{PREDICTION_NAME}",
-        f"{COPIES_FOLDER}/",
+        f"{PREDICTED_FOLDER}/{PREDICTION_NAME}", f"{COPIES_FOLDER}/",
     ),
 )  # fmt: skip
+PLACING = Part("placing", (), free=True)
 REFINEMENT = Part("refinement", (TRACKS_NAME,), free=True)
 FILTERS = Part("filters", ("",), free=True)
 FORMATS = Part("formats", (), free=True)
-PARTS = (ADAPTATION, PREDICTION, REFINEMENT, FILTERS, FORMATS)
-"""Parts of a job's settings: photos, model and adapter; how they are used; whether bundle adjustment follows; which
-pixels become points; which files."""
+PARTS = (ADAPTATION, PREDICTION, PLACING, REFINEMENT, FILTERS, FORMATS)
+"""Parts of a job's settings: photos, model and adapter; how they are used; known and shared cameras, and scale; whether
+bundle adjustment follows; which pixels become points; which files."""
 CPU = Compute()
 _warned_of: list[str] = []
 
@@ -91,16 +107,17 @@ def predict(
     batch: ImageBatch,
     *,
     reference: str | None = None,
+    priors: Priors | None = None,
     pose_from: PoseFrom = "camera",
     compute: Compute = CPU,
 ) -> Reconstruction:
     """Reconstruct prepared images with the model and the adapter that is on, if any.
 
     `reference` None is the model's own rule, with and without an adapter: results before and after adaptation differ in
-    nothing else. UserError when the images do not fit into memory together, FreeGeoError when the model answers with
-    values that are not finite.
+    nothing else. The model is told `priors`; the cameras of the result are those that it predicts. UserError when the
+    images do not fit into memory together, FreeGeoError when the model answers with values that are not finite.
     """
-    result = _predict(model, batch, reference=reference, pose_from=pose_from, compute=compute)
+    result = _predict(model, batch, reference=reference, priors=priors, pose_from=pose_from, compute=compute)
     trouble = not_finite(result)
     if trouble:
         raise FreeGeoError(f"{trouble} Try --precision fp32, and check the weights.")
@@ -108,18 +125,34 @@ def predict(
 
 
 def _predict(
-    model: ReconstructionModel, batch: ImageBatch, *, reference: str | None, pose_from: PoseFrom, compute: Compute
+    model: ReconstructionModel,
+    batch: ImageBatch,
+    *,
+    reference: str | None,
+    priors: Priors | None,
+    pose_from: PoseFrom,
+    compute: Compute,
 ) -> Reconstruction:
+    require_reference(reference, priors)
     plan_reconstruction(model, len(batch), batch.image_hw, compute=compute)
     model.to(compute.device).eval()
     with compute.autocast():
         tokens = embed_in_chunks(model, batch.images, device=compute.device)
-        features = model.aggregate(tokens, reference=reference or model.spec.reference)
+        features = model.aggregate(tokens, reference=reference or model.spec.reference, priors=priors)
         if pose_from == "rays":
             prediction = model.decode(features, want=("depth", "ray_cameras"))
         else:
             prediction = model.decode(features)
     return Reconstruction.from_prediction(prediction, batch)
+
+
+def require_reference(reference: str | None, priors: Priors | None) -> None:
+    """Raise UserError for a rule of the reference view where the model is told cameras, which leave no choice."""
+    if priors is not None and reference not in (None, "first"):
+        raise UserError(
+            f"the first photo is the reference view where the model is told cameras, not that of the rule "
+            f"'{reference}'. Leave --reference out."
+        )
 
 
 def require_pose_from(spec: ModelSpec, pose_from: PoseFrom) -> None:
@@ -150,6 +183,10 @@ def reconstruct(
     photos: PhotoSource,
     *,
     adapter: Adapter | str | Path | None = None,
+    cameras: KnownCameras | str | Path | None = None,
+    trust_cameras: bool = False,
+    one_camera: bool | None = None,
+    scale: str | None = None,
     reference: str | None = None,
     device: str | None = None,
     precision: str | None = None,
@@ -164,6 +201,12 @@ def reconstruct(
         photos: what `freegeo.load_photos` takes or returned.
         adapter: an adapter of this model, or the folder of a saved one; it is used for this call, and the model is left
             as it was. None: the model in its present state, with the adapter that is on, if there is one.
+        cameras: known cameras of the photos, wholly or in part: what `freegeo.read_cameras` returned, or a file that it
+            reads. The model is told them where it can take them, and the result has them as they were given.
+        trust_cameras: use poses without checking them by the matches between the photos.
+        one_camera: photos of one camera (same size, same EXIF data) share one focal length; None: frames of a video do.
+        scale: where metres come from: `gps`, a measured distance such as "IMG_1.jpg:812,410 IMG_2.jpg:655,398 = 1.25",
+            or a text file of these.
         reference: rule of the reference view; None: the model's own, with and without an adapter.
         device: cpu, cuda, cuda:N or mps; None: the best available.
         precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
@@ -181,9 +224,43 @@ def reconstruct(
     require_pose_from(model.spec, pose_from)
     _warn_of_model(model)
     compute = Compute.choose(device, precision)
-    batch = read_photos(model, load_photos(photos, max_views), mixed=mixed)
+    if cameras is not None or scale is not None:
+        require_cameras(model.spec)
+    found, known = _with_cameras(load_photos(photos, max_views), cameras, trust=trust_cameras)
+    source = None if scale is None else read_scale(scale, found)
+    batch = read_photos(model, found, mixed=mixed)
+    priors = _told(known, batch, model.spec)
+    if isinstance(adapter, str | Path):
+        about = adapter_files.adapter_metadata(adapter_files.find_adapter(adapter)) or {}
+        if said := _other_use(about, priors):
+            logger.warning("%s: %s", adapter, said)
     with _applied(model, adapter):
-        return predict(model, batch, reference=reference, pose_from=pose_from, compute=compute)
+        result = predict(model, batch, reference=reference, priors=priors, pose_from=pose_from, compute=compute)
+    if known is not None:
+        result = with_known_cameras(result, known).result
+    if is_one_camera(found) if one_camera is None else one_camera:
+        result, _ = with_one_camera(result, found, known)
+    return result if source is None else in_metres(result, source, found)
+
+
+def _with_cameras(
+    photos: Sequence[PhotoLike], cameras: KnownCameras | str | Path | None, *, trust: bool
+) -> tuple[Sequence[PhotoLike], KnownCameras | None]:
+    """Return the photos, undistorted, with their cameras, which are checked unless they are trusted."""
+    if cameras is None:
+        return photos, None
+    photos, known = known_cameras(photos, cameras)
+    if not trust:
+        check_known(known, photos)
+    return photos, known
+
+
+def _told(known: KnownCameras | None, batch: ImageBatch, spec: ModelSpec) -> Priors | None:
+    """Return what a model is told of known cameras, and say so."""
+    priors, sentence = told(known, batch, spec)
+    if sentence:
+        logger.info("%s", sentence)
+    return priors
 
 
 def _applied(model: ReconstructionModel, adapter: Adapter | str | Path | None) -> AbstractContextManager[None]:
@@ -201,6 +278,17 @@ def _applied(model: ReconstructionModel, adapter: Adapter | str | Path | None) -
             "with freegeo.load_adapter."
         )
     return adapter.applied()
+
+
+def _other_use(metadata: Mapping[str, Any], priors: Priors | None) -> str | None:
+    """Say that an adapter was trained with known cameras and is used without, or the reverse; None where it was not."""
+    trained = bool(metadata.get("with_cameras"))
+    if not metadata or trained == (priors is not None):
+        return None
+    with_or_without = (
+        "with known cameras, and is used without" if trained else "without known cameras, and is used with"
+    )
+    return f"the adapter was trained {with_or_without} them, for which it was not made."
 
 
 @contextmanager
@@ -237,6 +325,8 @@ def adapt(
     sets: int | None = None,
     loss: Mapping[str, Any] | None = None,
     seed: int = SEED,
+    cameras: KnownCameras | str | Path | None = None,
+    trust_cameras: bool = False,
     device: str | None = None,
     precision: str | None = None,
     max_views: int = MAX_VIEWS,
@@ -266,6 +356,9 @@ def adapt(
         sets: view sets per scene.
         loss: settings of the loss, such as `{"weight_kq": 0.0}`.
         seed: of everything random.
+        cameras: known cameras of the photos, as for `reconstruct`; teacher and student are told them, where the model
+            can take them. Otherwise they have no part in the adaptation.
+        trust_cameras: use poses without checking them by the matches between the photos.
         device: cpu, cuda, cuda:N or mps; None: the best available.
         precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
         max_views: most photos that are used; a list that `freegeo.load_photos` returned is used whole.
@@ -294,8 +387,10 @@ def adapt(
         pycolmap_module()
     found = load_photos(photos, max_views)
     require_enough_photos(found)
+    found, known = _with_cameras(found, cameras, trust=trust_cameras)
     batch = read_photos(model, found, mixed=mixed)
-    images = [scene_images("photos", found, model, plan, batch)]
+    priors = _told(known, batch, model.spec)
+    images = [scene_images("photos", found, model, plan, batch, priors)]
     frozen = judging = None
     if plan.cameras:
         images, frozen, judging = with_targets(model, images, [(found, batch)], seed=seed, compute=compute)
@@ -306,7 +401,10 @@ def adapt(
             keep_after=() if guard == "off" else SHARES,
         )  # fmt: skip
     if not result.trouble:
-        judge_by_photos(model, result, [(found, batch)], compute=compute, guard=guard, frozen=frozen, judging=judging)
+        judge_by_photos(
+            model, result, [(found, batch)], compute=compute, guard=guard, frozen=frozen, judging=judging,
+            priors=[priors],
+        )  # fmt: skip
     if result.trouble:
         logger.warning("%s", _capital(result.trouble))
     return result
@@ -342,7 +440,10 @@ def with_targets(
         NoEvidenceError: the matches of a scene prove no cameras.
     """
     if frozen is None:
-        frozen = [predict(model, batch, reference=reference, compute=compute) for _, batch in scenes]
+        frozen = [
+            predict(model, batch, reference=reference, priors=one.priors, compute=compute)
+            for one, (_, batch) in zip(images, scenes, strict=True)
+        ]
     lessons = [
         lesson(one.name, photos, before, store, seed=seed, device=str(compute.device))
         for one, (photos, _), before, store in zip(images, scenes, frozen, stores or [None] * len(scenes), strict=True)
@@ -362,6 +463,7 @@ def judge_by_photos(
     frozen: Sequence[Reconstruction] | None = None,
     stores: Sequence[Path | None] | None = None,
     judging: Sequence[Matches] | None = None,
+    priors: Sequence[Priors | None] | None = None,
     pose_from: PoseFrom = "camera",
 ) -> None:
     """Judge a finished adapter by the photos of its scenes, and keep the verdict in the result.
@@ -378,18 +480,24 @@ def judge_by_photos(
         frozen: predictions without the adapter; None: they are made here.
         stores: files for the matches of the scenes; None: they are not stored.
         judging: the matches that judge, where others taught; None: all matches of the photos.
+        priors: what the model is told of each scene; None: nothing.
         pose_from: where cameras of predictions come from.
     """
+    known = {id(batch): part for (_, batch), part in zip(scenes, priors or [None] * len(scenes), strict=True)}
 
     def predicted(batch: ImageBatch) -> Reconstruction | None:
-        found = _predict(model, batch, reference=reference, pose_from=pose_from, compute=compute)
+        found = _predict(
+            model, batch, reference=reference, priors=known[id(batch)], pose_from=pose_from, compute=compute
+        )
         return found if not_finite(found) is None else None
 
     if frozen is None:
         try:
             with result.adapter.off():
                 frozen = [
-                    predict(model, batch, reference=reference, pose_from=pose_from, compute=compute)
+                    predict(
+                        model, batch, reference=reference, priors=known[id(batch)], pose_from=pose_from, compute=compute
+                    )
                     for _, batch in scenes
                 ]
         except UserError as error:
@@ -400,7 +508,9 @@ def judge_by_photos(
     asked = guard != "off" and all(one.has_cameras for one in frozen)
     if not asked or guard == "report":
         for (_, batch), before in zip(scenes, frozen, strict=True):
-            found = _predict(model, batch, reference=reference, pose_from=pose_from, compute=compute)
+            found = _predict(
+                model, batch, reference=reference, priors=known[id(batch)], pose_from=pose_from, compute=compute
+            )
             wrong = not_finite(found) or harm(before, found)
             if wrong:
                 result.harm = f"{wrong} Lower --lr (now {result.recipe.lr:g}) or take fewer --steps."
@@ -448,12 +558,19 @@ def _warn_of_model(model: ReconstructionModel) -> None:
 
 
 def scene_images(
-    name: str, photos: Sequence[PhotoLike], model: ReconstructionModel, recipe: Recipe, batch: ImageBatch
+    name: str,
+    photos: Sequence[PhotoLike],
+    model: ReconstructionModel,
+    recipe: Recipe,
+    batch: ImageBatch,
+    priors: Priors | None = None,
 ) -> SceneImages:
     """Return photos as a scene to adapt to: `batch`, or the photos themselves for a recipe with a size of its own."""
     if recipe.squash is None:
-        return SceneImages.from_batch(name, batch)
-    return SceneImages.from_photos(name, photos, model, recipe)
+        scene = SceneImages.from_batch(name, batch)
+    else:
+        scene = SceneImages.from_photos(name, photos, model, recipe)
+    return replace(scene, priors=priors)
 
 
 def require_enough_photos(photos: Sequence[PhotoLike]) -> None:
@@ -490,6 +607,14 @@ class Job:
     """A saved adapter to reconstruct with, instead of training one."""
     guard: Guard = "select"
     """Whether the photos' matches judge the adapter, and whether their verdict decides what is used."""
+    known: KnownCameras | None = None
+    """Known cameras of the photos, which the result has as they were given."""
+    priors: Priors | None = None
+    """What the model is told of them (`freegeo.posed.told`)."""
+    one_camera: bool = False
+    """Whether photos of one camera share one focal length."""
+    scale: ScaleSource | None = None
+    """Where metres come from; None: from known cameras or a metric model, if at all."""
     pose_from: PoseFrom = "camera"
     """Where the cameras of all predictions come from."""
     refine: bool = False
@@ -529,6 +654,8 @@ class Job:
             return None
         about = adapter_files.adapter_metadata(self.adapter) or {}
         verdict = about.get("verdict") or {}
+        if said := _other_use(about, self.priors):
+            self._warn(f"{self.adapter}: {said}")
         doubt = about.get("trouble") or (verdict.get("reason") if verdict.get("outcome") != "adapted" else None)
         if doubt:
             self._warn(f"{self.adapter}: an adapter to be doubted. {_capital(doubt)}")
@@ -548,9 +675,9 @@ class Job:
         if rejected is not None:
             self._warn(f"{_capital(rejected)} The result is that of the frozen model.")
         trained = self.recipe is not None and final is not frozen
-        final = self._refined(final, frozen)
+        final, about = self._result(final, frozen)
         report, failed = self._export(final)
-        summary = self._summary(final, report, rejected, verdict, failed, trained=trained)
+        summary = self._summary(final, report, rejected, verdict, failed, about, trained=trained)
         write_json(self.folder / SUMMARY_NAME, summary)
         self.after(self)
         self.hooks.stage("report")
@@ -561,12 +688,17 @@ class Job:
     def _predicted(self, folder: Path, stage: str) -> Reconstruction:
         """Predict with the frozen model, or with `adapter`, or read what is there already."""
         if (folder / PREDICTION_NAME).is_file():
-            return Reconstruction.load(self._unrefined if folder == self.folder.path else folder)
+            return Reconstruction.load(self._predicted_folder if folder == self.folder.path else folder)
         if self.adapter is not None:
             assert self.in_place is not None
         with self._timed(stage):
             result = predict(
-                self.model, self.batch, reference=self.reference, pose_from=self.pose_from, compute=self.compute
+                self.model,
+                self.batch,
+                reference=self.reference,
+                priors=self.priors,
+                pose_from=self.pose_from,
+                compute=self.compute,
             )
             result.save(folder)
         return result
@@ -609,7 +741,7 @@ class Job:
                 started = time.monotonic()
                 judge_by_photos(
                     self.model, result, [(self.photos, self.batch)], compute=self.compute, guard=self.guard,
-                    reference=self.reference, frozen=[frozen], stores=stores, judging=judging,
+                    reference=self.reference, frozen=[frozen], stores=stores, judging=judging, priors=[self.priors],
                     pose_from=self.pose_from,
                 )  # fmt: skip
                 seconds["evidence"] = round(time.monotonic() - started, 2)
@@ -623,11 +755,16 @@ class Job:
         path = self.folder.path
         if (path / PREDICTION_NAME).is_file():
             rejected = self._noted("prediction").get("rejected")
-            return (Reconstruction.load(self._unrefined), None) if rejected is None else (frozen, rejected)
+            return (Reconstruction.load(self._predicted_folder), None) if rejected is None else (frozen, rejected)
         assert self.in_place is not None
         with self._timed("adapted prediction"):
             result = _predict(
-                self.model, self.batch, reference=self.reference, pose_from=self.pose_from, compute=self.compute
+                self.model,
+                self.batch,
+                reference=self.reference,
+                priors=self.priors,
+                pose_from=self.pose_from,
+                compute=self.compute,
             )
             rejected = not_finite(result)
             if rejected is None:
@@ -639,34 +776,73 @@ class Job:
         return frozen, rejected
 
     @property
-    def _unrefined(self) -> Path:
-        """Folder of the model's prediction, whether the result is refined or not."""
-        before = self.folder / UNREFINED_FOLDER
-        return before if (before / PREDICTION_NAME).is_file() else self.folder.path
+    def _predicted_folder(self) -> Path:
+        """Folder of the model's prediction, whatever the result made of it."""
+        places = (self.folder / PREDICTED_FOLDER, self.folder / UNREFINED_FOLDER)
+        return next((place for place in places if (place / PREDICTION_NAME).is_file()), self.folder.path)
 
-    def _refined(self, chosen: Reconstruction, frozen: Reconstruction | None) -> Reconstruction:
-        """Make the result of the chosen prediction, and see that it is in the folder: refined if that is asked for."""
+    def _result(
+        self, predicted: Reconstruction, frozen: Reconstruction | None
+    ) -> tuple[Reconstruction, dict[str, Any]]:
+        """Make the result of a prediction, and see that it is in the folder; returns facts for reconstruction.json."""
+        path, kept, before = self.folder.path, self.folder / PREDICTED_FOLDER, self.folder / UNREFINED_FOLDER
+        placed, about = self._placed(predicted)
+        changed = placed is not predicted or self.scale is not None
+        if changed and predicted is not frozen and not (kept / PREDICTION_NAME).is_file():
+            predicted.save(kept)
+        if self.refine and self._is_refined(placed, frozen, is_frozen=predicted is frozen):
+            return Reconstruction.load(path), about
+        result, _ = self._in_metres(placed)
+        if changed or predicted is frozen or self._predicted_folder != path:
+            result.save(path)
+        remove_written(before)
+        if not changed:
+            remove_written(kept)
+        return result, about
+
+    def _placed(self, predicted: Reconstruction) -> tuple[Reconstruction, dict[str, Any]]:
+        """Give a prediction known and shared cameras; it comes back as it is where there is nothing to do."""
+        about: dict[str, Any] = {"known_cameras": None, "one_camera": None}
+        if self.known is not None:
+            posed = with_known_cameras(predicted, self.known)
+            predicted = posed.result
+            about["known_cameras"] = {**posed.about, "model": told(self.known, self.batch, self.spec)[1]}
+        if self.one_camera:
+            assert self.photos is not None
+            predicted, about["one_camera"] = with_one_camera(predicted, self.photos, self.known)
+        return predicted, about
+
+    def _in_metres(self, result: Reconstruction, tracks: Tracks | None = None) -> tuple[Reconstruction, Tracks | None]:
+        """Bring a result, and points measured in it, to metres where that is asked for."""
+        if self.scale is None:
+            return result, tracks
+        assert self.photos is not None
+        metric = in_metres(result, self.scale, self.photos)
+        if tracks is not None and metric is not result:
+            assert metric.scale is not None
+            tracks = replace(tracks, xyz=tracks.xyz * metric.scale.value)
+        return metric, tracks
+
+    def _is_refined(self, placed: Reconstruction, frozen: Reconstruction | None, *, is_frozen: bool) -> bool:
+        """Refine a prediction, unless that is done, and write what comes of it where it is accepted."""
         path, before = self.folder.path, self.folder / UNREFINED_FOLDER
-        if self.refine and "accepted" not in self._noted("refinement"):
+        if "accepted" not in self._noted("refinement"):
             assert self.photos is not None
             with self._timed("refinement", REFINEMENT):
                 found = refine_by_photos(
-                    chosen, self.photos, frozen=None if chosen is frozen else frozen,
-                    store=self.folder / MATCHES_NAME, device=str(self.compute.device),
+                    placed, self.photos, frozen=None if is_frozen else frozen, store=self.folder / MATCHES_NAME,
+                    device=str(self.compute.device),
                 )  # fmt: skip
                 if found.tracks is not None:
-                    if chosen is not frozen:
-                        chosen.save(before)
-                    save_tracks(path, found.tracks)
-                    found.result.save(path)
+                    if placed is not frozen:
+                        placed.save(before)
+                    result, tracks = self._in_metres(found.result, found.tracks)
+                    assert tracks is not None
+                    save_tracks(path, tracks)
+                    result.save(path)
                 self.folder.note("refinement", {**self._noted("refinement"), **found.about})
             logger.info("%s: %s", "refined" if found.tracks is not None else "not refined", found.about["reason"])
-        if self.refine and self._noted("refinement")["accepted"]:
-            return Reconstruction.load(path)
-        if chosen is frozen or self._unrefined == before:
-            chosen.save(path)
-            remove_written(before)
-        return chosen
+        return self._noted("refinement")["accepted"]
 
     def _warn(self, sentence: str) -> None:
         """Log a warning that reconstruction.json must hold, whoever listens to the log."""
@@ -690,6 +866,7 @@ class Job:
         rejected: str | None,
         verdict: Mapping[str, Any] | None,
         failed: Mapping[str, str],
+        about: Mapping[str, Any],
         *,
         trained: bool,
     ) -> dict[str, Any]:
@@ -708,8 +885,9 @@ class Job:
             "rejected_adapter": None if trained or self.recipe is None else rejected or (verdict or {}).get("reason"),
             "verdict": verdict,
             "refinement": {k: v for k, v in self._noted("refinement").items() if k != "seconds"} or None,
+            **about,
             "frozen_prediction": None if self.recipe is None else f"{FROZEN_FOLDER}/{PREDICTION_NAME}",
-            "reference_view": self.reference or self.spec.reference,
+            "reference_view": "first" if self.priors is not None else self.reference or self.spec.reference,
             "pose_from": self.pose_from if self.spec.cameras else None,
             "not_written": dict(failed),
             "warnings": list(self.warnings),

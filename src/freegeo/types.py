@@ -204,18 +204,54 @@ def _read_meta(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, int]]:
     return {name: (int(tensors[name][0]), int(tensors[name][1])) for name in _META_KEYS}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cameras:
-    """Known cameras of a view set."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Priors:
+    """What is known of a view set before a model sees it; every part may be missing, for all views or for some.
 
-    T_cam_world: Tensor
-    """(..., S, 4, 4)."""
-    K: Tensor
-    """(..., S, 3, 3), pixels of the images they travel with."""
+    Tensors are on the CPU, in the world frame and unit of their source: each model normalises them itself. What a model
+    can take is in its `ModelSpec.takes`.
+    """
 
-    def to(self, device: torch.device | str) -> Self:
-        """Move both tensors to a device."""
-        return replace(self, T_cam_world=self.T_cam_world.to(device), K=self.K.to(device))
+    T_cam_world: Tensor | None = None
+    """(B, S, 4, 4); None: no pose is known."""
+    K: Tensor | None = None
+    """(B, S, 3, 3), pixels of the model's images; None: no intrinsics are known."""
+    depth_z: Tensor | None = None
+    """(B, S, H, W) at the model's size, 0 where it is not known; None: no depth is known."""
+    has_pose: Tensor | None = None
+    """(S,) bool: views whose pose is known; None: all, where there are poses."""
+    has_K: Tensor | None = None
+    """(S,) bool: views whose intrinsics are known; None: all, where there are any."""
+    metric: bool = False
+    """Whether lengths are metres."""
+
+    @property
+    def whole_cameras(self) -> bool:
+        """Whether poses and intrinsics of all views are known."""
+        return _all_known(self.T_cam_world, self.has_pose) and _all_known(self.K, self.has_K)
+
+    def select(self, views: Sequence[int]) -> Self:
+        """Return the chosen views, in the order given."""
+        index = list(views)
+        masks = {name: getattr(self, name) for name in ("has_pose", "has_K")}
+        tensors = {name: getattr(self, name) for name in ("T_cam_world", "K", "depth_z")}
+        return replace(
+            self,
+            **{name: mask[index] for name, mask in masks.items() if mask is not None},
+            **{name: value[:, index] for name, value in tensors.items() if value is not None},
+        )
+
+    def digest(self) -> str:
+        """Return a fingerprint of all values."""
+        found = hashlib.sha256(repr(self.metric).encode())
+        for name in ("T_cam_world", "K", "depth_z", "has_pose", "has_K"):
+            value = getattr(self, name)
+            found.update(name.encode() if value is None else name.encode() + value.contiguous().numpy().tobytes())
+        return found.hexdigest()[:16]
+
+
+def _all_known(values: Tensor | None, known: Tensor | None) -> bool:
+    return values is not None and (known is None or bool(known.all()))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -52,7 +52,7 @@ def test_true_cameras_belong_to_the_models_images(setup):
     width = batch.image_hw[1]
     torch.testing.assert_close(cameras.K[0, :, 0, 2] / width, scene.K[:, 0, 2] / 64, atol=1e-3, rtol=0)
     torch.testing.assert_close(cameras.K[0, :, 0, 0] / width, scene.K[:, 0, 0] / 64, atol=1e-3, rtol=0)
-    torch.testing.assert_close(cameras.T_cam_world[0, 0], torch.eye(4), atol=1e-5, rtol=0)
+    assert torch.equal(cameras.T_cam_world[0].double(), scene.T_cam_world.double())
 
 
 @pytest.mark.parametrize("rule", FRAME_RULES)

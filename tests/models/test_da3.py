@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,10 @@ sys.path.append(str(TESTS))  # parity_da3.py is shared with the full parity run 
 from fixture_tools import relative_error  # noqa: E402
 from freegeo.errors import UserError  # noqa: E402
 from freegeo.geometry.rays import cameras_from_rays  # noqa: E402
+from freegeo.geometry.se3 import normalise_poses  # noqa: E402
 from freegeo.models import reference  # noqa: E402
-from freegeo.types import Cameras  # noqa: E402
+from freegeo.models.priors import usable  # noqa: E402
+from freegeo.types import Priors  # noqa: E402
 from parity_da3 import build, cases  # noqa: E402
 
 FOLDER = TESTS / "fixtures" / "da3"
@@ -31,6 +34,13 @@ def tokens(model):
     images = torch.rand(2, 5, 3, 28, 42, generator=torch.Generator().manual_seed(4))
     with torch.no_grad():
         return model.embed(images)
+
+
+def known_cameras() -> Priors:
+    """Five cameras side by side that look the same way, of the two scenes of `tokens`."""
+    T = torch.eye(4).repeat(2, 5, 1, 1)
+    T[..., 0, 3] = torch.arange(5.0)
+    return Priors(T_cam_world=T, K=torch.eye(3).repeat(2, 5, 1, 1) * 40)
 
 
 def test_recorded_cases_are_found():
@@ -76,11 +86,41 @@ def test_layer_before_the_views_mix_must_be_kept_by_embed(model):
 
 @torch.no_grad()
 def test_known_cameras_replace_the_learned_tokens(model, tokens):
-    cameras = Cameras(T_cam_world=torch.eye(4).repeat(2, 5, 1, 1), K=torch.eye(3).repeat(2, 5, 1, 1) * 40)
-    cameras.T_cam_world[..., 0, 3] = torch.arange(5.0)
-    plain, known = model.aggregate(tokens), model.aggregate(tokens, cameras=cameras)
+    plain, known = model.aggregate(tokens), model.aggregate(tokens, priors=known_cameras())
     last = max(plain.levels)
     assert relative_error(known.levels[last][0], plain.levels[last][0]) > 1e-4
+
+
+@torch.no_grad()
+def test_known_cameras_are_normalised_by_the_model(model, tokens):
+    """World frame, unit and reference rule do not matter, also where the world is so far off that float32 fails."""
+    priors = known_cameras()
+    frame = torch.eye(4, dtype=torch.float64)
+    frame[:3, 3] = torch.tensor([5e5, -5e6, 100.0])
+    moved = priors.T_cam_world.double() @ frame
+    moved[..., :3, 3] *= 30.0
+    for other in (replace(priors, T_cam_world=moved), replace(priors, has_pose=torch.ones(5, dtype=torch.bool))):
+        one, two = (model.aggregate(tokens, reference="middle", priors=p).levels for p in (priors, other))
+        assert all(relative_error(two[layer][0], one[layer][0]) < 1e-4 for layer in one)
+
+
+@torch.no_grad()
+def test_priors_are_what_a_caller_would_normalise_and_encode(model, tokens):
+    """To the bit: the benchmark's numbers with given cameras are made so."""
+    priors = known_cameras()
+    known = model.encode_cameras(normalise_poses(priors.T_cam_world), priors.K, tokens.image_hw)
+    ours, by_hand = model.aggregate(tokens, priors=priors), model.mix(tokens, model.config.out_layers, None, known)
+    assert all(torch.equal(ours.levels[layer][0], by_hand.levels[layer][0]) for layer in by_hand.levels)
+
+
+@pytest.mark.parametrize("missing", [{"K": None}, {"T_cam_world": None}, {"has_pose": torch.arange(5) > 0}])
+@torch.no_grad()
+def test_a_part_of_the_cameras_is_refused(model, tokens, missing):
+    priors = replace(known_cameras(), **missing)
+    with pytest.raises(UserError, match="poses and intrinsics of all photos, or none"):
+        model.aggregate(tokens, priors=priors)
+    assert usable(priors, model.spec) is None
+    assert usable(known_cameras(), model.spec) is not None
 
 
 @torch.no_grad()

@@ -19,7 +19,7 @@ from freegeo.models.catalog import build_empty  # noqa: E402
 from freegeo.models.vggt import CameraHead  # noqa: E402
 from freegeo.models.vggt_config import VGGTConfig  # noqa: E402
 from freegeo.models.vggt_images import apply_plan, plan_size, preprocess  # noqa: E402
-from freegeo.types import Cameras  # noqa: E402
+from freegeo.types import Priors  # noqa: E402
 from parity_vggt import build, cases  # noqa: E402
 from parity_vggt_functions import synthetic  # noqa: E402
 
@@ -73,9 +73,9 @@ def test_other_references_and_known_cameras_are_refused(model):
     tokens = model.embed(torch.rand(1, 3, 3, 28, 28))
     with pytest.raises(UserError, match="first view as reference"):
         model.aggregate(tokens, reference="saddle_balanced")
-    cameras = Cameras(T_cam_world=torch.eye(4).repeat(1, 3, 1, 1), K=torch.eye(3).repeat(1, 3, 1, 1))
-    with pytest.raises(UserError, match="known cameras"):
-        model.aggregate(tokens, cameras=cameras)
+    priors = Priors(T_cam_world=torch.eye(4).repeat(1, 3, 1, 1), K=torch.eye(3).repeat(1, 3, 1, 1))
+    with pytest.raises(UserError, match="takes no cameras"):
+        model.aggregate(tokens, priors=priors)
 
 
 @torch.no_grad()

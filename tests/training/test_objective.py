@@ -22,7 +22,7 @@ from freegeo.training.objective import (
     zero_motion_rotation,
 )
 from freegeo.training.state import new_state
-from freegeo.types import Cameras, Features
+from freegeo.types import Features
 
 
 @pytest.fixture(scope="module")
@@ -152,11 +152,9 @@ def test_given_cameras_reach_their_samples_only_and_train_the_encoder(batch):
     told = replace(batch, cameras_given=torch.tensor([False, True]))
     tokens, learned = camera_tokens(state.model, told), camera_tokens(state.model, batch)
     assert torch.equal(tokens[0], learned[0]) and not torch.allclose(tokens[1], learned[1])
-    camera = Cameras(
-        T_cam_world=se3.normalise_poses(se3.inverse(batch.T_world_cam)),
-        K=K_from_fov(*batch.fov_vh.unbind(-1), tuple(batch.images.shape[-2:])),
-    )
-    expected = state.model.encode_cameras(camera, tuple(batch.images.shape[-2:]))
+    image_hw = tuple(batch.images.shape[-2:])
+    poses, K = se3.normalise_poses(se3.inverse(batch.T_world_cam)), K_from_fov(*batch.fov_vh.unbind(-1), image_hw)
+    expected = state.model.encode_cameras(poses, K, image_hw)
     torch.testing.assert_close(tokens[1], expected[1], atol=1e-4, rtol=1e-4)
     config = TrainConfig(depth_views=1, cameras_given=0.5)
     terms = objective(state.model, state.read_outs, told, config, 1, torch.Generator().manual_seed(0))

@@ -79,6 +79,8 @@ class Adapted:
     seconds: float = 0.0
     """Duration, with that of the earlier parts of a run that was continued."""
     precision: str = "fp32"
+    with_cameras: bool = False
+    """Whether the model was told known cameras."""
 
     def __repr__(self) -> str:
         """Return the recipe, the number of steps, the loss at start and end, the duration, and whether to beware."""
@@ -101,6 +103,7 @@ class Adapted:
             "seed": self.seed,
             "scenes": list(self.scenes),
             "precision": self.precision,
+            "with_cameras": self.with_cameras,
             "loss_curve": self.curve,
             # JSON has no infinity.
             "gain": {name: value if math.isfinite(value) else None for name, value in self.gain.items()},
@@ -204,6 +207,8 @@ def adapt(
     """
     require_seed(seed)
     require_targets(scenes, recipe)
+    if any(scene.priors is not None for scene in scenes):
+        require_unchanged_images(recipe)
     compute = compute.preferring(recipe.precision)
     if said := substitution([scene.count for scene in scenes], recipe):
         logger.info(said)
@@ -240,6 +245,15 @@ def require_targets(scenes: Sequence[SceneImages], recipe: Recipe) -> None:
         )
 
 
+def require_unchanged_images(recipe: Recipe) -> None:
+    """Raise UserError for a recipe that mirrors or squashes images, which known cameras do not follow."""
+    if recipe.squash is not None or recipe.augmentation != "none":
+        raise UserError(
+            f"recipe '{recipe.name}' mirrors or squashes the images, and known cameras are of the photos as they are. "
+            "Choose another --recipe, such as scene, or leave the cameras out."
+        )
+
+
 @dataclass(frozen=True)
 class _Run:
     """The arguments of `adapt`, with the visits of every step."""
@@ -267,7 +281,7 @@ def _train(run: _Run, plan: Plan) -> Adapted:
     )  # fmt: skip
     result = Adapted(
         adapter=adapter, recipe=recipe, seed=run.seed, scenes=tuple(scene.name for scene in run.scenes),
-        precision=run.compute.precision,
+        precision=run.compute.precision, with_cameras=any(scene.priors is not None for scene in run.scenes),
     )  # fmt: skip
     with ExitStack() as undo:
         undo.callback(adapter.detach)
@@ -335,7 +349,7 @@ def _student_loss(run: _Run, adapter: Adapter, visit: Visit, sample: Sample) -> 
     recipe = run.recipe
     tokens, teacher = sample.student()
     with run.compute.autocast():
-        student = loss_features(adapter.model, tokens)
+        student = loss_features(adapter.model, tokens, sample.student_priors())
     losses, terms = [], {}
     if recipe.features:
         draws = step_draws(sample, visit, recipe.loss, seed=run.seed)
@@ -354,7 +368,7 @@ def _all_views_loss(run: _Run, adapter: Adapter, sample: Sample) -> tuple[Tensor
     """Return the losses of all N views (not in the paper): features held where they were, cameras as above."""
     recipe = run.recipe
     with run.compute.autocast():
-        adapted = loss_features(adapter.model, sample.tokens)
+        adapted = loss_features(adapter.model, sample.tokens, sample.priors)
     terms = {}
     if recipe.hold:
         distance, _ = feature_distance(adapted.levels, sample.teacher.levels, recipe.loss, patches=sample.patches)
@@ -496,10 +510,10 @@ class _State:
     def _identity(self) -> str:
         """Return a fingerprint of model name, scenes, recipe, seed and precision; pixels and weights are left out.
 
-        The targets of a scene are in it: they depend on more than the photos.
+        Targets and priors of a scene are in it: they depend on more than the photos.
         """
         scenes = [
-            (scene.name, scene.count, None if scene.targets is None else scene.targets.digest())
+            (scene.name, scene.count, *(part and part.digest() for part in (scene.targets, scene.priors)))
             for scene in self.run.scenes
         ]
         model, recipe = self.run.model.spec.name, asdict(self.run.recipe)

@@ -38,7 +38,7 @@ from freegeo.adaptation.views import ViewSet, Visit
 from freegeo.errors import UserError
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.precision import Compute
-from freegeo.types import Features, ImageBatch, PhotoLike, ViewTokens
+from freegeo.types import Features, ImageBatch, PhotoLike, Priors, ViewTokens
 
 Place = Literal["device", "disk"]
 """Where samples are kept between visits: on the model's device, or in memory-mapped files."""
@@ -68,6 +68,8 @@ class SceneImages:
     """(count, H, W) bool: false where an image is padding; None: no image has any."""
     targets: CameraTargets | None = None
     """Cameras of the images to learn from; needed by a recipe with the weight `cameras`."""
+    priors: Priors | None = None
+    """What teacher and student are told of the images, all of which the model can take (`models.priors.usable`)."""
 
     @classmethod
     def from_batch(cls, name: str, batch: ImageBatch) -> SceneImages:
@@ -151,6 +153,8 @@ class Sample:
     """(views of `tokens`, P) bool, on the CPU: patches that take part in the losses; None: all."""
     targets: CameraTargets | None = None
     """Cameras of the views of `tokens`; None where the recipe has no camera term."""
+    priors: Priors | None = None
+    """What is known of the views of `tokens`; None: nothing. They stay on the CPU."""
 
     def student(self) -> tuple[ViewTokens, Mapping[int, Level]]:
         """Return tokens and teacher features of the student's views."""
@@ -165,6 +169,10 @@ class Sample:
     def student_targets(self) -> CameraTargets | None:
         """Return the cameras of the student's views."""
         return None if self.targets is None else self.targets.select(self.kept)
+
+    def student_priors(self) -> Priors | None:
+        """Return what is known of the student's views."""
+        return None if self.priors is None else self.priors.select(self.kept)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors by name."""
@@ -242,9 +250,10 @@ class Samples:
     def _make(self, visit: Visit) -> Sample:
         """Run the teacher on the views of a set."""
         view_set, config, model = visit.view_set, self._recipe.loss, self._adapter.model
-        tokens = next(self._tokens)
+        tokens, priors = next(self._tokens), self._scenes[view_set.scene].priors
+        known = None if priors is None else priors.select(view_set.frames)
         with self._adapter.off(), self._compute.autocast():
-            features = loss_features(model, tokens)
+            features = loss_features(model, tokens, known)
         read = view_set.positions if self._recipe.sees_all else view_set.kept
         targets = self._scenes[view_set.scene].targets if self._recipe.cameras else None
         patches = seen_patches(self._scenes[view_set.scene], view_set, tokens.grid_hw, self._recipe)
@@ -255,6 +264,7 @@ class Samples:
             kept=tuple(read.index(position) for position in view_set.kept),
             patches=None if patches is None else patches[list(read)],
             targets=None if targets is None else targets.select([view_set.frames[position] for position in read]),
+            priors=None if known is None else known.select(read),
         )
         measured = self._recipe.features and config.uses_distances and config.pairing == "all"
         if self._compute.device.type == "cpu" or not measured:
@@ -327,9 +337,9 @@ def distinct(view_sets: Iterable[ViewSet], recipe: Recipe) -> list[ViewSet]:
     return list(found.values())
 
 
-def loss_features(model: ReconstructionModel, tokens: ViewTokens) -> Features:
+def loss_features(model: ReconstructionModel, tokens: ViewTokens, priors: Priors | None = None) -> Features:
     """Return what a loss compares: the features at the loss layers, the first view being the reference."""
-    return model.aggregate(tokens, layers=model.spec.loss_layers, reference="first")
+    return model.aggregate(tokens, layers=model.spec.loss_layers, reference="first", priors=priors)
 
 
 def step_seed(seed: int, step: int) -> int:

@@ -39,12 +39,11 @@ from freegeo.data.datasets.registry import get_dataset, load_scene, scene_names
 from freegeo.data.scene import Scene
 from freegeo.errors import UserError
 from freegeo.files import write_json
-from freegeo.geometry import se3
 from freegeo.geometry.camera import resize_K
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import load_model
 from freegeo.models.precision import Compute, Precision
-from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
+from freegeo.types import Features, ImageBatch, Prediction, Priors, ViewTokens
 
 AdaptPer = Literal["dataset", "scene"]
 DEFAULT_ROW = "procedural"
@@ -215,14 +214,14 @@ class Predictor:
         values = {"mse": float((student - teacher).square().mean()), "cosine": float(cosine)}
         return [sample[position] for position in kept], values
 
-    def _read(self, scene: Scene, frames: Sequence[int]) -> tuple[ViewTokens, Cameras | None]:
-        """The embedded frames and, where the run gives the model the true cameras, these in the model's convention."""
+    def _read(self, scene: Scene, frames: Sequence[int]) -> tuple[ViewTokens, Priors | None]:
+        """The embedded frames and, where the run gives the model the true cameras, these."""
         chosen = scene.select(frames)
         batch = self.model.preprocess(list(chosen.photos), mixed="upstream")
         tokens = self._embedded(batch.images)
         if not self.setup.given_cameras:
             return tokens, None
-        return tokens, true_cameras(chosen, batch).to(self.compute.device)
+        return tokens, true_cameras(chosen, batch)
 
     def _embedded(self, images: Tensor) -> ViewTokens:
         """Embed images (S, 3, H, W); UserError when so many cannot be reconstructed in the memory that is free."""
@@ -230,9 +229,9 @@ class Predictor:
         with self.compute.autocast():
             return embed_in_chunks(self.model, images, device=self.compute.device)
 
-    def _features(self, tokens: ViewTokens, cameras: Cameras | None = None) -> Features:
+    def _features(self, tokens: ViewTokens, priors: Priors | None = None) -> Features:
         with self.compute.autocast():
-            return self.model.aggregate(tokens, reference="first", cameras=cameras)
+            return self.model.aggregate(tokens, reference="first", priors=priors)
 
     def _base(self) -> dict[str, Any]:
         loaded = self.model.loaded_from
@@ -299,12 +298,12 @@ def problem_of(stage: Literal["predict", "evaluate"]) -> Callable[[Task, BaseExc
     return explain
 
 
-def true_cameras(scene: Scene, batch: ImageBatch) -> Cameras:
-    """True cameras (1, S) of a scene, poses normalised, K in pixels of its `batch`; UserError without truth."""
+def true_cameras(scene: Scene, batch: ImageBatch) -> Priors:
+    """True cameras of a scene, K in pixels of its `batch`; UserError without truth."""
     truth, T_cam_world, K = require_truth(scene)
     sizes = zip(K, truth.camera_hw, scene.photos, strict=True)
     photo_K = torch.stack([resize_K(one, camera_hw, photo.size_hw) for one, camera_hw, photo in sizes])
-    return Cameras(T_cam_world=se3.normalise_poses(T_cam_world)[None], K=batch.model_K(photo_K)[None])
+    return Priors(T_cam_world=T_cam_world[None], K=batch.model_K(photo_K)[None], metric=True)
 
 
 def listed_scenes(data: Path, dataset: str, limit: int | None) -> tuple[str, ...]:

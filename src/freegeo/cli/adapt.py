@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
 from freegeo.cli.jobs import LABELS, check_place, say_finished
-from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
+from freegeo.cli.options import CameraOptions, ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source, split_scenes
 from freegeo.progress import step_bar
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from freegeo.types import ImageBatch, PhotoLike
 
 DEFAULT_RECIPE, DEFAULT_MODEL, DEFAULT_PHOTOS = RecipeOptions(), ModelOptions(), PhotoOptions()
+NO_CAMERAS = CameraOptions()
 FILES = {
     "adapter_config.json": "peft's settings",
     "adapter_model.safetensors": "LoRA weights",
@@ -37,6 +38,7 @@ def adapt(
     model: ModelOptions = DEFAULT_MODEL,
     recipe: RecipeOptions = DEFAULT_RECIPE,
     photos: PhotoOptions = DEFAULT_PHOTOS,
+    cameras: CameraOptions = NO_CAMERAS,
     published: bool = False,
     guard: Guard = "select",
 ) -> None:
@@ -52,8 +54,11 @@ def adapt(
         select: matches between the photos decide which state of the adapter is saved; report: they are only asked;
         off.
     """
+    from freegeo.adaptation.adapt import require_unchanged_images
+    from freegeo.errors import UserError
     from freegeo.models.images import read_photos
     from freegeo.pipeline import require_enough_photos, scene_images
+    from freegeo.posed import check_known, told
     from freegeo.run_folder import run_folder
 
     check_place(output)
@@ -64,18 +69,30 @@ def adapt(
     model.warn_of_embedded(sources)
     for found in scenes.values():
         require_enough_photos(found)
+    if cameras.cameras is not None and len(scenes) > 1:
+        raise UserError(f"--cameras is for one scene, and there are {len(scenes)}. Adapt to one, or leave it out.")
+    name = next(iter(scenes))
+    scenes[name], known = cameras.read(scenes[name])
     batches = {name: read_photos(empty, found, mixed=photos.mixed) for name, found in scenes.items()}
+    priors, sentence = told(known, batches[name], empty.spec)
+    if sentence:
+        console.note(sentence)
+    if priors is not None:
+        require_unchanged_images(plan)
     about = {name: {"photos": list(batch.names), "contents": batch.digest()} for name, batch in batches.items()}
     settings = {
         "command": "adapt", "scenes": about, "published": published, "guard": guard, **model.identity(plan),
-        "recipe": asdict(plan),
+        "recipe": asdict(plan), **({} if priors is None else {"known_cameras": priors.digest()}),
     }  # fmt: skip
     with run_folder(output.output, settings, overwrite=output.overwrite, labels=LABELS) as folder:
         if folder.finished:
             say_finished(output.output, folder.finished_at)
             return
+        if priors is not None and known is not None and not cameras.trust_cameras:
+            console.note("known cameras against matches between the photos ...")
+            check_known(known, scenes[name])
         loaded = model.load()
-        images = [scene_images(name, scenes[name], loaded, plan, batch) for name, batch in batches.items()]
+        images = [scene_images(name, scenes[name], loaded, plan, batch, priors) for name, batch in batches.items()]
         pairs = [(found, batches[name]) for name, found in scenes.items()]
         _train(loaded, images, plan, model, folder.path, published=published, guard=guard, scenes=pairs)
         folder.finish()
@@ -114,7 +131,10 @@ def _train(
             on_epoch=keep_epoch, keep_after=() if guard == "off" else SHARES,
         )  # fmt: skip
     if result.trouble is None:
-        judge_by_photos(loaded, result, scenes, compute=compute, guard=guard, frozen=frozen, judging=judging)
+        judge_by_photos(
+            loaded, result, scenes, compute=compute, guard=guard, frozen=frozen, judging=judging,
+            priors=[one.priors for one in images],
+        )  # fmt: skip
     result.save(folder)
     if result.trouble:
         raise FreeGeoError(f"{folder}: {result.trouble} The adapter is there to be looked at; do not use it.")

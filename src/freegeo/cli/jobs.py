@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
@@ -12,7 +13,15 @@ from typing import TYPE_CHECKING, Any
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
 from freegeo.cli.files import FileOptions, require_complete
-from freegeo.cli.options import ModelOptions, OutputOptions, RecipeOptions, Refine, refines
+from freegeo.cli.options import (
+    CameraOptions,
+    ModelOptions,
+    OutputOptions,
+    PlacingOptions,
+    RecipeOptions,
+    Refine,
+    refines_with,
+)
 from freegeo.errors import UserError
 from freegeo.export import reconstruction as npz
 from freegeo.export.base import KEPT_NAME, TRACKS_NAME
@@ -25,16 +34,22 @@ from freegeo.progress import step_bar
 from freegeo.run_folder import check_folder, run_folder, stored_state
 
 if TYPE_CHECKING:
+    from freegeo.cameras.known import KnownCameras
+    from freegeo.metres import ScaleSource
     from freegeo.pipeline import Hooks, Job
     from freegeo.types import PhotoLike
 
 logger = logging.getLogger(__name__)
 
 DEFAULT_FILES = FileOptions()
+NO_CAMERAS, DEFAULT_PLACING = CameraOptions(), PlacingOptions()
 _OTHER_CONTENTS = "photos with other contents"
 LABELS = {
     "photos": "other photos", "photo_contents": _OTHER_CONTENTS, "contents": _OTHER_CONTENTS, "scenes": "other scenes",
     "checkpoint": "other weights", "weights": "another adapter", "folder": "--adapter", "masks": "other masks",
+    "known_cameras": "other known cameras",
+    "scale": "another --scale",
+    "one_camera": "--one-camera",
     "command": "the command", "recipe": "--adapt", "name": "--recipe", "sets_per_scene": "--sets",
     "adapting_precision": "--precision", "refinement": "--refine",
     **dict.fromkeys(
@@ -56,11 +71,12 @@ FILES = {
     npz.FORMAT.path: npz.FORMAT.about,
     "frozen/prediction.npz": "the same before adaptation",
     "unrefined/prediction.npz": "the same before refinement",
+    "predicted/prediction.npz": "as the model predicted it, before known or shared cameras and scale",
     TRACKS_NAME: "measured points of the refinement",
     KEPT_NAME: "which pixels the filters kept as points",
     "adapter": "the adapter (peft format)",
     **{format.path: format.about for format in FORMATS.values()},
-    COPIES_FOLDER: "upright copies of the photos, or the frames of the video that were used",
+    COPIES_FOLDER: "upright copies of the photos (undistorted ones), or the frames of the video that were used",
     "reconstruction.json": "settings, timings, versions, licence of the weights",
 }
 
@@ -87,6 +103,8 @@ def run_job(
     guard: Guard = "select",
     refine: Refine = "off",
     pose_from: PoseFrom = "camera",
+    cameras: CameraOptions = NO_CAMERAS,
+    placing: PlacingOptions = DEFAULT_PLACING,
     extra_settings: dict[str, Any] | None = None,
     after: Callable[[Job], None] = lambda job: None,
 ) -> None:
@@ -96,17 +114,32 @@ def run_job(
     filters, masks and formats are written from the predictions that it holds. `after` writes more before the folder
     counts as finished.
     """
+    from freegeo.adaptation.adapt import require_unchanged_images
+    from freegeo.cameras.undistortion import UndistortedPhoto
     from freegeo.data.video import VideoFrame
+    from freegeo.metres import read_scale
     from freegeo.models.images import read_photos
-    from freegeo.pipeline import PARTS, SUMMARY_NAME, Job, require_enough_photos, require_pose_from, scene_images
+    from freegeo.pipeline import (
+        MATCHES_NAME,
+        PARTS,
+        SUMMARY_NAME,
+        Job,
+        require_enough_photos,
+        require_pose_from,
+        require_reference,
+        scene_images,
+    )
+    from freegeo.posed import check_known, is_one_camera, require_cameras, told, undistorted_masks
 
     check_place(output)
     empty = model_options.build_empty()
     formats = files.all_formats(output, photos, has_cameras=empty.spec.cameras)
     require_pose_from(empty.spec, pose_from)
-    refining = refines(refine) and empty.spec.cameras
+    refining = refines_with(cameras, refine) and empty.spec.cameras
     if refine == "ba" and not refining:
         raise UserError(f"{empty.spec.name} predicts no cameras, so there are none to refine. Leave --refine out.")
+    if cameras.cameras is not None or placing.scale is not None:
+        require_cameras(empty.spec)
     if recipe is not None:
         empty.adaptable()
     plan = None if recipe is None else recipe.build(empty.spec)
@@ -120,12 +153,23 @@ def run_job(
     if empty.spec.caution:
         logger.warning("%s", empty.spec.caution)
     masks = files.checked_masks(photos)
+    photos, known = cameras.read(photos)
+    masks = undistorted_masks(masks, photos)
+    scale = None if placing.scale is None else read_scale(placing.scale, photos)
+    one_camera = is_one_camera(photos) if placing.one_camera is None else placing.one_camera
     batch = read_photos(empty, photos, mixed=mixed)
+    priors, sentence = told(known, batch, empty.spec)
+    if sentence:
+        console.note(sentence)
+    require_reference(model_options.reference, priors)
+    if plan is not None and priors is not None:
+        require_unchanged_images(plan)
     adaptation = {
         "photos": list(batch.names), "photo_contents": batch.digest(), **model_options.identity(plan),
         "recipe": None if plan is None else asdict(plan),
         "guard": None if plan is None else guard,
         "adapter": None if adapter is None else adapter_identity(adapter),
+        **({} if priors is None else {"known_cameras": priors.digest()}),
     }  # fmt: skip
     settings = {
         "command": command,
@@ -136,6 +180,7 @@ def run_job(
             # Only where it is not the default, so that folders of earlier versions count as finished.
             **({} if pose_from == "camera" else {"pose_from": pose_from}),
         },
+        **placing_settings(known, scale, one_camera=one_camera),
         "refinement": "ba" if refining else "off",
         "filters": files.filter_settings(masks),
         "formats": formats,
@@ -146,18 +191,33 @@ def run_job(
             say_finished(output.output, folder.finished_at)
             require_complete(output.output, read_json(folder / SUMMARY_NAME).get("not_written", {}))
             return
-        write_copies([photo for photo in photos if isinstance(photo, VideoFrame)], folder / COPIES_FOLDER)
+        if known is not None and not cameras.trust_cameras:
+            console.note("known cameras against matches between the photos ...")
+            check_known(known, photos, folder / MATCHES_NAME)
+        if any(isinstance(photo, VideoFrame | UndistortedPhoto) for photo in photos):
+            write_copies(photos, folder / COPIES_FOLDER)
         job = Job(
             load=model_options.load, spec=empty.spec, batch=batch, folder=folder, recipe=plan, adapter=adapter,
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), warnings=console.warned(), after=after, formats=formats, photos=photos,
             filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity, guard=guard,
-            refine=refining, pose_from=pose_from,
-            scene=None if plan is None else lambda model: scene_images("photos", photos, model, plan, batch),
+            refine=refining, pose_from=pose_from, known=known, priors=priors, one_camera=one_camera, scale=scale,
+            scene=None if plan is None else lambda model: scene_images("photos", photos, model, plan, batch, priors),
         )  # fmt: skip
         summary = job.run()
         describe(summary, output.output)
     require_complete(output.output, summary["not_written"])
+
+
+def placing_settings(known: KnownCameras | None, scale: ScaleSource | None, *, one_camera: bool) -> dict[str, Any]:
+    """Return the part of a job's settings about known and shared cameras, and scale; empty without any of them."""
+    from freegeo.posed import digest
+
+    values = {
+        "known_cameras": None if known is None else digest(known), "one_camera": one_camera,
+        "scale": None if scale is None else hashlib.sha256(repr(scale).encode()).hexdigest()[:16],
+    }  # fmt: skip
+    return {"placing": values} if any(values.values()) else {}
 
 
 def check_place(output: OutputOptions) -> None:
@@ -203,8 +263,12 @@ def describe(summary: dict[str, Any], folder: Path) -> None:
     """Print the outcome of a job."""
     say_answer(summary)
     console.say(f"{len(summary['images'])} views at {summary['image_hw'][1]} x {summary['image_hw'][0]} pixels")
+    if summary["known_cameras"]:
+        say_known(summary["known_cameras"])
     if summary["scale"]:
-        console.say(f"lengths are metres (from {summary['scale']['source']})")
+        spread = summary["scale"]["spread"]
+        certain = "" if spread is None else f", to {100 * spread:.2g} %"
+        console.say(f"lengths are metres (from {summary['scale']['source']}{certain})")
     if summary["loss"]:
         first, last = summary["loss"]["first"], summary["loss"]["last"]
         console.say(f"adaptation loss {first:.4f} -> {last:.4f} (means of the first and last tenth of the steps)")
@@ -213,3 +277,14 @@ def describe(summary: dict[str, Any], folder: Path) -> None:
     for sentence in summary["warnings"]:
         console.say(f"warning: {sentence}")
     console.written(folder, FILES)
+
+
+def say_known(about: dict[str, Any]) -> None:
+    """Print what known cameras made of the prediction."""
+    parts = [f"poses of {about['poses']} and intrinsics of {about['intrinsics']} photos as given"]
+    if about["scale"] is not None:
+        parts.append(f"depth times {about['scale']:.4g}")
+    if about["rotation_deg"] is not None:
+        far = "" if about["position"] is None else f", {100 * about['position']:.2g} % of the longest distance"
+        parts.append(f"predicted cameras differed by {about['rotation_deg']:.2g} degrees{far} in the median")
+    console.say(f"cameras of {about['source']}: {'; '.join(parts)}")

@@ -27,9 +27,11 @@ SMALL_MODEL = 20_000_000
 """Parameters below which a model runs on one CPU thread."""
 
 if TYPE_CHECKING:
+    from freegeo.cameras.known import KnownCameras
     from freegeo.models.api import ReconstructionModel
     from freegeo.models.precision import Compute
     from freegeo.models.spec import ModelSpec
+    from freegeo.types import PhotoLike
 
 
 @Parameter(name="*")
@@ -147,6 +149,15 @@ def model_of_adapter(adapter: Path, model: str | None) -> str:
     return made_for
 
 
+def refines_with(cameras: CameraOptions, refine: Refine) -> bool:
+    """As `refines`, but known cameras are not to be moved: with them `auto` is off, and `ba` is refused."""
+    if cameras.cameras is None:
+        return refines(refine)
+    if refine == "ba":
+        raise UserError("--refine ba would move the cameras that are known. Leave out --refine or --cameras.")
+    return False
+
+
 def refines(refine: Refine) -> bool:
     """Whether bundle adjustment follows; UserError where it is asked for and not installed."""
     if refine == "auto":
@@ -260,6 +271,49 @@ class PhotoOptions:
     """Leave out photos that cannot be read, with a warning, instead of stopping."""
     mixed: Mixed = MIXED
     """Photos of different shapes: cut the odd ones, pad all with white (nothing is lost), or do as upstream does."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class CameraOptions:
+    """Known cameras of the photos."""
+
+    cameras: Path | None = None
+    """Known poses and intrinsics, wholly or in part: a file, or a folder such as a COLMAP project (docs/cameras.md)."""
+    cameras_format: str | None = None
+    """cameras.json, colmap, nerfstudio, tum, kitti or poses; default: by content."""
+    cameras_convention: str | None = None
+    """How pose matrices are meant: w2c-opencv, c2w-opencv, w2c-opengl or c2w-opengl; default: as the format says."""
+    metric: Annotated[bool, Parameter(negative="")] = False
+    """Lengths in the camera file are metres."""
+    trust_cameras: Annotated[bool, Parameter(negative="")] = False
+    """Use poses without checking them by matches between the photos."""
+
+    def read(self, photos: Sequence[PhotoLike]) -> tuple[list[PhotoLike], KnownCameras | None]:
+        """Return the photos, without distortion, and their known cameras; UserError for cameras that cannot be used."""
+        if self.cameras is None:
+            if self.cameras_format or self.cameras_convention or self.metric or self.trust_cameras:
+                raise UserError("the options about cameras need the file with these: --cameras FILE.")
+            return list(photos), None
+        from freegeo.cameras.reading import read_cameras
+        from freegeo.posed import known_cameras
+
+        known = read_cameras(
+            self.cameras, photos, format=self.cameras_format, metric=self.metric, convention=self.cameras_convention
+        )
+        return known_cameras(photos, known)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class PlacingOptions:
+    """What is done with a prediction before points are made of it."""
+
+    one_camera: bool | None = None
+    """Photos of one camera (same size and EXIF data) share one focal length; default: for videos only."""
+    scale: str | None = None
+    """Where metres come from: gps, a measured distance such as "a.jpg:812,410 b.jpg:655,398 = 1.25" (column and row
+    of two places, and metres), or a text file of these."""
 
 
 @Parameter(name="*")

@@ -6,11 +6,20 @@ from pathlib import Path
 
 from freegeo.cli.files import FileOptions
 from freegeo.cli.jobs import DEFAULT_FILES, run_job
-from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, Refine, refines
+from freegeo.cli.options import (
+    CameraOptions,
+    ModelOptions,
+    OutputOptions,
+    PhotoOptions,
+    PlacingOptions,
+    Refine,
+    refines_with,
+)
 from freegeo.cli.sources import load_source
 from freegeo.models.spec import PoseFrom
 
 DEFAULT_MODEL, DEFAULT_PHOTOS = ModelOptions(), PhotoOptions()
+NO_CAMERAS, DEFAULT_PLACING = CameraOptions(), PlacingOptions()
 
 
 def reconstruct(
@@ -18,6 +27,8 @@ def reconstruct(
     output: OutputOptions,
     model: ModelOptions = DEFAULT_MODEL,
     photos: PhotoOptions = DEFAULT_PHOTOS,
+    cameras: CameraOptions = NO_CAMERAS,
+    placing: PlacingOptions = DEFAULT_PLACING,
     files: FileOptions = DEFAULT_FILES,
     adapter: Path | None = None,
     refine: Refine = "off",
@@ -40,7 +51,7 @@ def reconstruct(
     """
     from freegeo.adaptation.adapter_files import find_adapter
 
-    refines(refine)  # refused, where it has to be, before photos are read
+    refines_with(cameras, refine)  # refused, where it has to be, before photos are read
     if adapter is not None:
         adapter = find_adapter(adapter)
         model = model.for_adapter(adapter)
@@ -48,5 +59,5 @@ def reconstruct(
     model.warn_of_embedded(sources)
     run_job(
         found, model, output, command="reconstruct", recipe=None, adapter=adapter, mixed=photos.mixed, files=files,
-        refine=refine, pose_from=pose_from,
+        refine=refine, pose_from=pose_from, cameras=cameras, placing=placing,
     )  # fmt: skip

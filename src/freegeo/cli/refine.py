@@ -48,6 +48,8 @@ def refine(
     summary = read_json(source / SUMMARY_NAME) if (source / SUMMARY_NAME).is_file() else {}
     if (summary.get("refinement") or {}).get("accepted"):
         raise UserError(f"{source}: is refined already.")
+    if summary.get("known_cameras"):
+        raise UserError(f"{source}: its cameras are known ones, which are not to be moved.")
     photos = find_photos(before, source)
     if photos is None:
         raise UserError(f"{source}: its photos are not where they were, or have changed; matches need them.")

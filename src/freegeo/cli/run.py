@@ -5,11 +5,21 @@ from __future__ import annotations
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli.files import FileOptions
 from freegeo.cli.jobs import DEFAULT_FILES, run_job
-from freegeo.cli.options import ModelOptions, OutputOptions, PhotoOptions, RecipeOptions, Refine, refines
+from freegeo.cli.options import (
+    CameraOptions,
+    ModelOptions,
+    OutputOptions,
+    PhotoOptions,
+    PlacingOptions,
+    RecipeOptions,
+    Refine,
+    refines_with,
+)
 from freegeo.cli.sources import load_source
 from freegeo.models.spec import PoseFrom
 
 DEFAULT_RECIPE, DEFAULT_MODEL, DEFAULT_PHOTOS = RecipeOptions(), ModelOptions(), PhotoOptions()
+NO_CAMERAS, DEFAULT_PLACING = CameraOptions(), PlacingOptions()
 
 
 def run(
@@ -18,6 +28,8 @@ def run(
     model: ModelOptions = DEFAULT_MODEL,
     recipe: RecipeOptions = DEFAULT_RECIPE,
     photos: PhotoOptions = DEFAULT_PHOTOS,
+    cameras: CameraOptions = NO_CAMERAS,
+    placing: PlacingOptions = DEFAULT_PLACING,
     files: FileOptions = DEFAULT_FILES,
     adapt: bool = True,
     guard: Guard = "select",
@@ -43,11 +55,11 @@ def run(
     pose_from
         camera: cameras of the model's camera head; rays: found from the rays that it predicts (any-view models of DA3).
     """
-    refines(refine)  # refused, where it has to be, before photos are read
+    refines_with(cameras, refine)  # refused, where it has to be, before photos are read
     found = load_source(sources, photos)
     model.warn_of_embedded(sources)
     plan = recipe if adapt else None
     run_job(
         found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files, guard=guard, refine=refine,
-        pose_from=pose_from,
+        pose_from=pose_from, cameras=cameras, placing=placing,
     )  # fmt: skip

@@ -35,7 +35,7 @@ ABOUT = "COLMAP model; its README.txt says whether tracks are measured"
 NOTICE = """freegeo wrote this COLMAP model.
 
 sparse/0   cameras, images and points
-images     upright copies of the photos
+images     upright copies of the photos, without distortion where that was known
 
 Use the model with images/ (--image_path), not with the original photos: COLMAP and the trainers of Gaussian splats do
 not turn photos by their EXIF orientation, but these cameras are those of upright photos.

@@ -48,7 +48,7 @@ def fuse(reconstruction: Reconstruction, keep: np.ndarray, *, voxel: float) -> M
 
     from freegeo.fusion.tsdf import TsdfVolume
 
-    T_cam_world, K = (torch.from_numpy(a) for a in reconstruction.cameras())
+    T_cam_world, K = (torch.from_numpy(a).float() for a in reconstruction.cameras())
     volume = TsdfVolume(voxel=voxel, truncation=TRUNCATION_VOXELS * voxel)
     depth = torch.from_numpy(np.where(keep, reconstruction.depth_z, 0))
     for view in range(len(reconstruction)):
@@ -63,7 +63,7 @@ def vertex_colours(mesh: Mesh, reconstruction: Reconstruction, keep: np.ndarray,
     from freegeo.geometry.camera import project
     from freegeo.geometry.se3 import transform_points
 
-    T_cam_world, K = (torch.from_numpy(a) for a in reconstruction.cameras())
+    T_cam_world, K = (torch.from_numpy(a).float() for a in reconstruction.cameras())
     height, width = reconstruction.image_hw
     vertices = torch.from_numpy(mesh.vertices).float()
     total, count = np.zeros((len(vertices), 3)), np.zeros(len(vertices))

@@ -6,8 +6,8 @@ The keys are field names and must not change, because scripts of users read them
 |---|---|---|---|
 | `depth_z` | (S, H, W) | float32 | coordinate along the optical axis; metres with a scale, else up to scale |
 | `conf` | (S, H, W) | float32 | confidence, higher is better, not calibrated; 1 where the model gives none |
-| `T_cam_world` | (S, 4, 4) | float32 | world to camera, OpenCV axes; absent without cameras |
-| `K` | (S, 3, 3) | float32 | pixels of the H x W map, centres at whole numbers; absent without cameras |
+| `T_cam_world` | (S, 4, 4) | float32, known ones float64 | world to camera, OpenCV axes; absent without cameras |
+| `K` | (S, 3, 3) | as above | pixels of the H x W map, centres at whole numbers; absent without cameras |
 | `sky` | (S, H, W) | float32 | 0 and more; sky from .3 on; absent when the model does not give it |
 | `images` | (S, H, W, 3) | uint8 | the images the model read |
 | `names` | (S,) | str | names of the photos |
@@ -24,7 +24,7 @@ import math
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,6 +44,7 @@ FILE_NAME = "prediction.npz"
 VERSION = 1
 METRIC_MODEL = "a metric model"
 _OPTIONAL = ("T_cam_world", "K", "sky")
+_CAMERAS = ("T_cam_world", "K")
 _DTYPES = {"images": np.uint8, "photo_hw": np.int64, "scale_xy": np.float64, "offset_xy": np.float64}
 
 
@@ -98,9 +99,9 @@ class Reconstruction:
     offset_xy: np.ndarray
     """(S, 2) float64."""
     T_cam_world: np.ndarray | None = None
-    """(S, 4, 4) float32."""
+    """(S, 4, 4) float32 as predicted, float64 where cameras were known."""
     K: np.ndarray | None = None
-    """(S, 3, 3) float32."""
+    """(S, 3, 3), as above."""
     sky: np.ndarray | None = None
     """(S, H, W) float32."""
     scale: Scale | None = None
@@ -183,6 +184,24 @@ class Reconstruction:
 
         mapping = (self.photo_hw, self.scale_xy, self.offset_xy)
         return inside_photo(*map(torch.from_numpy, mapping), self.image_hw).numpy()
+
+    def scaled(self, factor: float, *, source: str, spread: float | None = None) -> Reconstruction:
+        """Return the reconstruction in metres: depth and camera positions times a factor, together.
+
+        Args:
+            factor: metres in a unit of its present lengths.
+            source: what that comes from, as it reads after "from".
+            spread: relative error of the factor; None: not known.
+
+        Raises:
+            FreeGeoError: a factor that is not positive.
+        """
+        scale = Scale(value=factor, source=source, spread=spread)
+        T = self.T_cam_world
+        if T is not None:
+            T = T.copy()
+            T[:, :3, 3] *= factor
+        return replace(self, depth_z=(self.depth_z * factor).astype(np.float32), T_cam_world=T, scale=scale)
 
     @classmethod
     def from_prediction(cls, prediction: Prediction, batch: ImageBatch) -> Reconstruction:
@@ -301,7 +320,9 @@ class Reconstruction:
         missing = [name for name in names if name not in arrays and name not in _OPTIONAL]
         if missing:
             raise FreeGeoError(f"{file}: not a reconstruction, {', '.join(missing)} missing. Name another file.")
-        values = {n: arrays[n].astype(_DTYPES.get(n, np.float32)) for n in names if n in arrays and n != "names"}
+        kept = {name: np.float64 for name in _CAMERAS if name in arrays and arrays[name].dtype == np.float64}
+        types = {**_DTYPES, **kept}
+        values = {n: arrays[n].astype(types.get(n, np.float32)) for n in names if n in arrays and n != "names"}
         try:
             return cls(**values, names=tuple(map(str, arrays["names"])), scale=Scale.from_arrays(arrays))
         except (FreeGeoError, ValueError) as error:

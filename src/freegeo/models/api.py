@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from freegeo.errors import UserError
 from freegeo.models.spec import MIXED, LoadedFrom, Mixed, ModelSpec
-from freegeo.types import Cameras, Features, ImageBatch, PhotoLike, Prediction, ViewTokens
+from freegeo.types import Features, ImageBatch, PhotoLike, Prediction, Priors, ViewTokens
 
 Want = Literal["depth", "cameras", "ray_cameras", "rays", "points"]
 """What `decode` can predict; `ray_cameras` are cameras found from the rays instead of those of the camera head."""
@@ -51,9 +51,13 @@ class ReconstructionModel(nn.Module, ABC):
         *,
         layers: Collection[int] | None = None,
         reference: str = "first",
-        cameras: Cameras | None = None,
+        priors: Priors | None = None,
     ) -> Features:
-        """Mix the views; `layers` limits the result to some of the decoder's layers, nothing above them is computed."""
+        """Mix the views; `layers` limits the result to some of the decoder's layers, nothing above them is computed.
+
+        `priors` are what is known of the views, in any world frame and unit: the model normalises them. UserError for
+        priors that `spec.takes` excludes (`freegeo.models.priors.usable` leaves these out and says so).
+        """
 
     @abstractmethod
     def decode(self, features: Features, *, want: Collection[Want] = ("depth", "cameras")) -> Prediction:

@@ -20,11 +20,13 @@ from torch import Tensor, nn
 from freegeo.errors import UserError
 from freegeo.geometry.camera import decode_camera_to_world, encode_camera_to_world
 from freegeo.geometry.rays import cameras_from_rays
+from freegeo.geometry.se3 import normalise_poses
 from freegeo.models import da3_images, reference
 from freegeo.models.api import ReconstructionModel, Want, check_layers, check_want, level_tokens
 from freegeo.models.da3_config import DA3Config
 from freegeo.models.dpt import DenseHead, confidence, depth_maps, read_in_chunks
 from freegeo.models.images import normalise, patch_grid
+from freegeo.models.priors import require_usable
 from freegeo.models.spec import MIXED, Mixed, ModelSpec
 from freegeo.models.transformer import (
     Block,
@@ -36,7 +38,7 @@ from freegeo.models.transformer import (
     position_table,
     run_block,
 )
-from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
+from freegeo.types import Features, ImageBatch, Prediction, Priors, ViewTokens
 
 SELECTION = "selection"
 RAY_SEED = 0
@@ -246,24 +248,38 @@ class DA3(DA3Images):
         *,
         layers: Collection[int] | None = None,
         reference: str = "first",
-        cameras: Cameras | None = None,
+        priors: Priors | None = None,
     ) -> Features:
-        """Run the cross-view blocks; known cameras replace the learned tokens and switch reference selection off."""
+        """Run the cross-view blocks; known cameras replace the learned tokens and make the first view the reference."""
         wanted = self.config.out_layers if layers is None else layers
         check_layers(wanted, self.config.depth, self.spec.name)
-        order = None if cameras is not None else self.view_order(tokens, reference)
-        known = None if cameras is None else self.encode_cameras(cameras, tokens.image_hw)
-        levels = self._vit.aggregate(tokens, wanted, order, known)
+        if priors is None:
+            return self.mix(tokens, wanted, self.view_order(tokens, reference), None)
+        require_usable(priors, self.spec)
+        assert priors.T_cam_world is not None
+        assert priors.K is not None
+        # Normalised in the precision they came in: a world far from its origin would lose digits in float32.
+        poses, K = (x.to(tokens.tokens.device, torch.float32) for x in (normalise_poses(priors.T_cam_world), priors.K))
+        return self.mix(tokens, wanted, None, self.encode_cameras(poses, K, tokens.image_hw))
+
+    def mix(
+        self, tokens: ViewTokens, layers: Collection[int], order: Tensor | None, camera_tokens: Tensor | None
+    ) -> Features:
+        """Run the cross-view blocks on views in an order (B, S); with camera tokens (B, S, D), or the learned ones."""
+        levels = self._vit.aggregate(tokens, layers, order, camera_tokens)
         return Features(levels=levels, image_hw=tokens.image_hw, grid_hw=tokens.grid_hw)
 
     def view_order(self, tokens: ViewTokens, rule: str) -> Tensor | None:
         """Return the reference-first order (B, S), or None where the input order stays (fewer than 3 views)."""
         return reference.view_order(tokens.extra[SELECTION], rule)
 
-    def encode_cameras(self, cameras: Cameras, image_hw: tuple[int, int]) -> Tensor:
-        """Return camera tokens (B, S, D) of known, already normalised cameras (`se3.normalise_poses`)."""
-        with torch.autocast(cameras.K.device.type, enabled=False):
-            return self.cam_enc(encode_camera_to_world(cameras.T_cam_world, cameras.K, image_hw))
+    def encode_cameras(self, T_cam_world: Tensor, K: Tensor, image_hw: tuple[int, int]) -> Tensor:
+        """Return camera tokens (B, S, D) of poses that are already normalised (`se3.normalise_poses`), and intrinsics.
+
+        The principal points are not used.
+        """
+        with torch.autocast(K.device.type, enabled=False):
+            return self.cam_enc(encode_camera_to_world(T_cam_world, K, image_hw))
 
     def decode(self, features: Features, *, want: Collection[Want] = ("depth", "cameras")) -> Prediction:
         """Read out depth, confidence, cameras and (only if in `want`) rays or the cameras of rays, in float32."""

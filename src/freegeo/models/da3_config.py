@@ -165,6 +165,7 @@ def _spec(
         metric=metric,
         ray_cameras=cameras,
         caution=caution,
+        takes="cameras" if cameras else "nothing",
     )
 
 
@@ -217,6 +218,7 @@ def embedded_spec(config: DA3Config) -> ModelSpec:
         weights_licence=APACHE,
         adaptation=AdaptationDefaults(temperature=2.5, scene_lr=1e-3, rank=16, neighbours=True),
         ray_cameras=True,
+        takes="cameras",
     )
 
 

@@ -19,7 +19,7 @@ from freegeo.models.da3_config import DA3Config
 from freegeo.models.dpt import DenseHead, read_in_chunks
 from freegeo.models.reference import require_rule
 from freegeo.models.spec import MIXED, Mixed, ModelSpec
-from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
+from freegeo.types import Features, ImageBatch, Prediction, Priors, ViewTokens
 
 logger = logging.getLogger(__name__)
 
@@ -72,13 +72,13 @@ class DA3SingleView(DA3Images):
         *,
         layers: Collection[int] | None = None,
         reference: str = "first",
-        cameras: Cameras | None = None,
+        priors: Priors | None = None,
     ) -> Features:
-        """Hand on what `embed` kept of each view; there is no reference view. UserError for known cameras."""
+        """Hand on what `embed` kept of each view; there is no reference view. UserError for priors."""
         wanted = self.config.out_layers if layers is None else layers
         check_layers(wanted, self.config.depth, self.spec.name)
         require_rule(reference)
-        if cameras is not None:
+        if priors is not None:
             raise UserError(f"{self.spec.name} looks at each photo by itself and takes no known cameras.")
         levels = self._vit.aggregate(tokens, wanted, None, None)
         return Features(levels=levels, image_hw=tokens.image_hw, grid_hw=tokens.grid_hw)
@@ -152,10 +152,10 @@ class DA3Nested(ReconstructionModel):
         *,
         layers: Collection[int] | None = None,
         reference: str = "first",
-        cameras: Cameras | None = None,
+        priors: Priors | None = None,
     ) -> Features:
         """Run the any-view part's cross-view blocks, and hand on the metric maps."""
-        found = self.da3.aggregate(tokens, layers=layers, reference=reference, cameras=cameras)
+        found = self.da3.aggregate(tokens, layers=layers, reference=reference, priors=priors)
         metric = {name: tokens.extra[name] for name in (METRIC_DEPTH, METRIC_SKY) if name in tokens.extra}
         return Features(levels=found.levels, image_hw=found.image_hw, grid_hw=found.grid_hw, extra=metric)
 

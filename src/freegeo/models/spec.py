@@ -21,6 +21,13 @@ Mixed = Literal["crop", "pad", "upstream"]
 MIXED: Mixed = "crop"
 
 
+Takes = Literal["nothing", "cameras"]
+"""What a model can be told of its views.
+
+`cameras`: poses together with intrinsics, of all views or of none.
+"""
+
+
 @dataclass(frozen=True, kw_only=True)
 class AdaptationDefaults:
     """Settings of the method that depend on the model's features, published or measured."""
@@ -60,6 +67,8 @@ class ModelSpec:
     """Whether it can also find cameras from a ray map."""
     caution: str | None = None
     """A sentence on its results that everyone who uses it has to read."""
+    takes: Takes = "nothing"
+    """What the model can be told of its views (`freegeo.types.Priors`)."""
 
 
 @dataclass(frozen=True, kw_only=True)

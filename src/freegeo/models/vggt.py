@@ -22,6 +22,7 @@ from freegeo.models import vggt_images
 from freegeo.models.api import ReconstructionModel, Want, check_layers, check_want, level_tokens
 from freegeo.models.dpt import DenseHead, confidence, depth_maps, read_in_chunks
 from freegeo.models.images import normalise, patch_grid
+from freegeo.models.priors import require_usable
 from freegeo.models.spec import MIXED, Mixed, ModelSpec
 from freegeo.models.transformer import (
     Block,
@@ -34,7 +35,7 @@ from freegeo.models.transformer import (
     run_block,
 )
 from freegeo.models.vggt_config import VGGTConfig
-from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
+from freegeo.types import Features, ImageBatch, Prediction, Priors, ViewTokens
 
 ENCODER_EPS = 1e-6
 BLOCK_EPS = 1e-5
@@ -221,15 +222,15 @@ class VGGT(ReconstructionModel):
         *,
         layers: Collection[int] | None = None,
         reference: str = "first",
-        cameras: Cameras | None = None,
+        priors: Priors | None = None,
     ) -> Features:
-        """Run the frame and global blocks; UserError for known cameras and for any reference but the first view."""
+        """Run the frame and global blocks; UserError for priors and for any reference but the first view."""
         wanted = self.config.out_layers if layers is None else layers
         check_layers(wanted, self.config.depth, self.spec.name)
         if reference != "first":
             raise UserError(f"{self.spec.name} takes the first view as reference, not '{reference}'. Use 'first'.")
-        if cameras is not None:
-            raise UserError(f"{self.spec.name} cannot use known cameras. Leave them out, or use a DA3 model.")
+        if priors is not None:
+            require_usable(priors, self.spec)
         levels = self.aggregator.aggregate(tokens.tokens, tokens.grid_hw, wanted)
         return Features(levels=levels, image_hw=tokens.image_hw, grid_hw=tokens.grid_hw)
 

@@ -124,6 +124,8 @@ def facts(result: Result) -> list[tuple[str, str]]:
         ("lengths", result.lengths),
         ("kept pixels", f"{_percent(final.keep.mean())} of {final.keep.size:,}"),
     ]
+    if known := summary.get("known_cameras"):
+        found.append(("known cameras", f"{known['poses']} poses, {known['intrinsics']} intrinsics"))
     if summary.get("loss"):
         found.append(("loss", f"{summary['loss']['first']:.4f} → {summary['loss']['last']:.4f}"))
     if summary.get("seconds"):

@@ -220,16 +220,21 @@ def _stage(
         depth_z = (depth_z * median_ratio(reference.depth_z, depth_z)).astype(np.float32)
     error = None if truth is None else relative_error(depth_z, truth.depth_z)
     return Stage(
-        key=key, depth_z=depth_z, conf=value.conf, T_cam_world=T_cam_world, K=value.K, keep=keep, removed=removed,
-        error=error,
+        key=key, depth_z=depth_z, conf=value.conf, T_cam_world=T_cam_world, K=_single(value.K), keep=keep,
+        removed=removed, error=error,
     )  # fmt: skip
 
 
 def _truth_stage(truth: Reconstruction) -> Stage:
     return Stage(
-        key="truth", depth_z=truth.depth_z, conf=np.ones_like(truth.depth_z), T_cam_world=truth.T_cam_world, K=truth.K,
-        keep=_valid(truth.depth_z), removed={}, error=np.zeros_like(truth.depth_z),
+        key="truth", depth_z=truth.depth_z, conf=np.ones_like(truth.depth_z),
+        T_cam_world=_single(truth.T_cam_world), K=_single(truth.K), keep=_valid(truth.depth_z), removed={},
+        error=np.zeros_like(truth.depth_z),
     )  # fmt: skip
+
+
+def _single(values: np.ndarray | None) -> np.ndarray | None:
+    return None if values is None else values.astype(np.float32)
 
 
 def _moved(depth_z: np.ndarray, T_cam_world: np.ndarray, move: Sim3) -> tuple[np.ndarray, np.ndarray]:

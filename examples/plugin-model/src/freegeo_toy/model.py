@@ -16,7 +16,7 @@ from freegeo.models.api import ReconstructionModel, Want, check_layers, check_wa
 from freegeo.models.da3_images import preprocess
 from freegeo.models.images import normalise, patch_grid
 from freegeo.models.spec import MIXED, AdaptationDefaults, Mixed, ModelSpec
-from freegeo.types import Cameras, Features, ImageBatch, Prediction, ViewTokens
+from freegeo.types import Features, ImageBatch, Prediction, Priors, ViewTokens
 from freegeo_toy import LICENCE
 
 WIDTH, HEADS, DEPTH, PATCH, SIDE = 24, 2, 2, 8, 64
@@ -80,12 +80,12 @@ class Toy(ReconstructionModel):
         *,
         layers: Collection[int] | None = None,
         reference: str = "first",
-        cameras: Cameras | None = None,
+        priors: Priors | None = None,
     ) -> Features:
         """Mix the views; level i holds the tokens after mixer i, with no special tokens among them."""
         wanted = range(DEPTH) if layers is None else layers
         check_layers(wanted, DEPTH, self.spec.name)
-        if reference != "first" or cameras is not None:
+        if reference != "first" or priors is not None:
             raise UserError("toy takes the first view as reference and no known cameras. Leave both options out.")
         x_BSPD, levels = tokens.tokens, {}
         for i in range(max(wanted) + 1):

@@ -1,0 +1,126 @@
+"""What known cameras are worth to the embedded model: generated rooms, with and without them, frozen and adapted.
+
+Run: python benchmarks/known_cameras.py [--domains test-id,big,...] [--rooms 25] [--views 4,8] [--steps 100]
+         [--checkpoint FILE] [--out FILE]
+
+For each room, the first photos of the path. `told`: the model is told the true cameras and predicts its own; `posed`:
+the result with the known cameras, as `freegeo run --cameras` writes it; `after`: the model sees the photos alone, and
+the known cameras are used after prediction. `--steps 0` leaves adaptation out. Printed: means of the frozen model, and
+changes against it with their intervals, paired over rooms.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import logging
+from pathlib import Path
+
+import numpy as np
+import torch
+from record import write_result
+
+import freegeo
+from freegeo.cameras.known import KnownCamera, KnownCameras
+from freegeo.data.procedural import get_domain, photograph_room
+from freegeo.data.scene import Scene
+from freegeo.metrics.bootstrap import paired_interval
+from freegeo.metrics.scene import evaluate
+from freegeo.models.api import ReconstructionModel
+from freegeo.models.images import read_photos
+from freegeo.pipeline import predict
+from freegeo.posed import priors_of, with_known_cameras
+
+DOMAINS = "test-id,big,tex,sparse"
+SCORES = ("auc05", "auc15", "auc30", "f1_rel5", "abs_rel")
+
+
+def cameras_of(scene: Scene) -> KnownCameras:
+    """Return the true cameras of a room, rotations exact to double precision."""
+    assert scene.T_cam_world is not None and scene.K is not None
+    cameras = []
+    for T, K in zip(scene.T_cam_world.double().numpy(), scene.K.double().numpy(), strict=True):
+        u, _, vh = np.linalg.svd(T[:3, :3])
+        pose, corner = T.copy(), K.copy()
+        pose[:3, :3] = u @ vh
+        corner[:2, 2] += 0.5
+        cameras.append(KnownCamera(T_cam_world=pose, K=corner))
+    names = tuple(photo.name for photo in scene.photos)
+    return KnownCameras(names=names, cameras=tuple(cameras), source=scene.name, metric=True)
+
+
+def scores_of(model: ReconstructionModel, scene: Scene, known: KnownCameras, way: str) -> dict[str, dict[str, float]]:
+    """Score the model as it is, alone and with the cameras."""
+    batch = read_photos(model, scene.photos)
+    alone = predict(model, batch)
+    told = predict(model, batch, priors=priors_of(known, batch))
+    found = {
+        way: alone,
+        f"{way}, after": with_known_cameras(alone, known).result,
+        f"{way}, told": told,
+        f"{way}, posed": with_known_cameras(told, known).result,
+    }
+    return {name: {metric: float(evaluate(one, scene)[metric]) for metric in SCORES} for name, one in found.items()}
+
+
+def room(model: ReconstructionModel, seed: int, domain: str, views: int, steps: int) -> dict:
+    """Measure one room."""
+    whole = photograph_room(seed, domain, frames=max(16, views))
+    scene = whole.select(range(views))
+    known = cameras_of(scene)
+    scores = scores_of(model, scene, known, "frozen")
+    for way, cameras in (("adapted", None), ("adapted with cameras", known)) if steps else ():
+        result = freegeo.adapt(model, scene.photos, steps=steps, guard="off", cameras=cameras, trust_cameras=True)
+        scores |= scores_of(model, scene, known, way)
+        result.adapter.detach()
+    return {"domain": domain, "seed": seed, "views": views, "scores": scores}
+
+
+def table(rows: list[dict]) -> dict[str, dict[str, list[float]]]:
+    """Return mean change against the frozen model alone, its interval, and of that model the mean."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for way in rows[0]["scores"]:
+        found[way] = {}
+        for metric in SCORES:
+            values = np.array([row["scores"][way][metric] for row in rows])
+            base = np.array([row["scores"]["frozen"][metric] for row in rows])
+            interval = [values.mean()] if way == "frozen" else list(paired_interval(values - base))
+            found[way][metric] = [round(float(value), 4) for value in interval[:3]]
+    return found
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--domains", default=DOMAINS)
+    parser.add_argument("--rooms", type=int, default=25)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--views", default="4,8")
+    parser.add_argument("--steps", type=int, default=100)
+    parser.add_argument("--checkpoint", type=Path)
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    logging.disable(logging.WARNING)
+    torch.set_num_threads(1)
+    model = freegeo.load_model("freegeo-tiny", checkpoint=arguments.checkpoint)
+    rows = []
+    for domain in arguments.domains.split(","):
+        for seed in get_domain(domain).seeds(arguments.rooms, start=arguments.first):
+            for views in map(int, arguments.views.split(",")):
+                rows.append(room(model, seed, domain, views, arguments.steps))
+            print(domain, seed, flush=True)
+    results = {}
+    for views in sorted({row["views"] for row in rows}):
+        chosen = [row for row in rows if row["views"] == views]
+        groups = {"all": chosen} | {d: [r for r in chosen if r["domain"] == d] for d in arguments.domains.split(",")}
+        results[f"{views} views"] = {name: table(group) for name, group in groups.items()}
+        for way, values in results[f"{views} views"]["all"].items():
+            print(f"{views} views, {len(chosen)} rooms, {way:28s}", values)
+    if arguments.out:
+        settings = {name: str(value) for name, value in vars(arguments).items()}
+        write_result(arguments.out, settings=settings, results={"tables": results, "rooms": rows}, show=False)
+
+
+if __name__ == "__main__":
+    main()
