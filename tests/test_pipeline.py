@@ -463,6 +463,18 @@ def test_photos_that_cannot_be_predicted_together_cost_no_adapter(model, monkeyp
     assert "Nobody looked at what the adapter does to predictions: too large" in caplog.text
 
 
+@pytest.mark.parametrize("guard", ["select", "report"])
+def test_photos_that_cannot_be_judged_together_are_refused_before_training(model, monkeypatch, guard):
+    def too_large(*arguments, **options):
+        raise UserError("too large")
+
+    monkeypatch.setattr(pipeline, "plan_reconstruction", too_large)
+    steps = []
+    with pytest.raises(UserError, match="too large"):
+        freegeo.adapt(model, pictures(), steps=3, sets=2, guard=guard, on_step=steps.append)
+    assert not steps
+
+
 def test_predictions_that_differ_by_frame_scale_and_little_else_are_no_harm(model):
     found = walked(freegeo.reconstruct(model, pictures()))
     T = found.T_cam_world

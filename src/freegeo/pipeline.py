@@ -391,9 +391,9 @@ def adapt(
     batch = read_photos(model, found, mixed=mixed)
     priors = _told(known, batch, model.spec)
     images = [scene_images("photos", found, model, plan, batch, priors)]
-    frozen = judging = None
-    if plan.cameras:
-        images, frozen, judging = with_targets(model, images, [(found, batch)], seed=seed, compute=compute)
+    images, frozen, judging = before_training(
+        model, images, [(found, batch)], plan, guard=guard, seed=seed, compute=compute
+    )
     folder = None if resume_in is None else Path(resume_in).expanduser()
     with step_bar(on_step) if progress else nullcontext(on_step) as follow:
         result = train_adapter(
@@ -408,6 +408,35 @@ def adapt(
     if result.trouble:
         logger.warning("%s", _capital(result.trouble))
     return result
+
+
+def before_training(
+    model: ReconstructionModel,
+    images: list[SceneImages],
+    scenes: Sequence[tuple[Sequence[PhotoLike], ImageBatch]],
+    plan: Recipe,
+    *,
+    guard: Guard,
+    seed: int,
+    compute: Compute,
+) -> tuple[list[SceneImages], list[Reconstruction] | None, list[Matches] | None]:
+    """Ask the frozen model for what judges the adapter and, by some recipes, teaches it (`with_targets`).
+
+    Photos that do not fit into memory together are refused here, before anything is trained.
+
+    Returns:
+        The scenes, with targets where the recipe learns from cameras; the frozen predictions, unless the guard is off;
+        the matches that are left to judge by, where others teach.
+    """
+    if plan.cameras:
+        return with_targets(model, images, scenes, seed=seed, compute=compute)
+    if guard == "off":
+        return images, None, None
+    frozen = [
+        predict(model, batch, priors=one.priors, compute=compute)
+        for one, (_, batch) in zip(images, scenes, strict=True)
+    ]
+    return images, frozen, None
 
 
 def with_targets(

@@ -114,17 +114,19 @@ def _train(
     from freegeo.adaptation.adapter_files import export_published, save_adapter
     from freegeo.errors import FreeGeoError
     from freegeo.evidence.guard import SHARES
-    from freegeo.pipeline import judge_by_photos, with_targets
+    from freegeo.pipeline import before_training, judge_by_photos
 
     def keep_epoch(epoch: int, adapter) -> None:
         if plan.epochs is not None:
             about = {"epoch": epoch, "scenes": [scene.name for scene in images], "seed": model.seed}
             save_adapter(adapter, folder / "epochs" / f"epoch_{epoch}", about)
 
-    compute, frozen, judging = model.compute(), None, None
+    compute = model.compute()
     if plan.cameras:
         console.note("cameras to learn from ...")
-        images, frozen, judging = with_targets(loaded, images, scenes, seed=model.seed, compute=compute)
+    images, frozen, judging = before_training(
+        loaded, images, scenes, plan, guard=guard, seed=model.seed, compute=compute
+    )
     with step_bar() as on_step:
         result = train_adapter(
             loaded, images, plan, seed=model.seed, compute=compute, resume_in=folder, on_step=on_step,
