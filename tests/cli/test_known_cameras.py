@@ -14,7 +14,6 @@ from freegeo.data.procedural import render, sample_rooms
 from freegeo.export.pixels import corner_K
 from freegeo.export.reconstruction import Reconstruction
 
-
 LITTLE = ["--formats", "npz"]
 
 
