@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -101,7 +101,6 @@ CPU = Compute()
 _warned_of: list[str] = []
 
 
-@torch.no_grad()
 def predict(
     model: ReconstructionModel,
     batch: ImageBatch,
@@ -124,6 +123,7 @@ def predict(
     return result
 
 
+@torch.no_grad()
 def _predict(
     model: ReconstructionModel,
     batch: ImageBatch,
@@ -840,6 +840,7 @@ class Job:
                 found = refine_by_photos(
                     placed, self.photos, frozen=None if is_frozen else frozen, store=self.folder / MATCHES_NAME,
                     device=str(self.compute.device),
+                    again=partial(self._told, is_frozen=is_frozen) if self.spec.takes == "cameras" else None,
                 )  # fmt: skip
                 if found.tracks is not None:
                     if placed is not frozen:
@@ -851,6 +852,16 @@ class Job:
                 self.folder.note("refinement", {**self._noted("refinement"), **found.about})
             logger.info("%s: %s", "refined" if found.tracks is not None else "not refined", found.about["reason"])
         return self._noted("refinement")["accepted"]
+
+    def _told(self, priors: Priors, *, is_frozen: bool) -> Reconstruction | None:
+        """Predict again with the model of the result, which is told cameras; None without finite numbers."""
+        # The adapter of a result that is the frozen model's may still be in place.
+        adapter = vars(self).get("in_place") if is_frozen else self.in_place
+        with adapter.off() if is_frozen and adapter is not None else nullcontext():
+            found = _predict(
+                self.model, self.batch, reference=None, priors=priors, pose_from="camera", compute=self.compute
+            )
+        return found if not_finite(found) is None else None
 
     def _warn(self, sentence: str) -> None:
         """Log a warning that reconstruction.json must hold, whoever listens to the log."""

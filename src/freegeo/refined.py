@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from freegeo.data.photos import MAX_VIEWS, load_photos
 from freegeo.errors import UserError
@@ -15,12 +16,12 @@ from freegeo.evidence import refinement
 from freegeo.evidence.bundle import pycolmap_module
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.guard import Reference
-from freegeo.evidence.refinement import Refinement, bring_depth
+from freegeo.evidence.refinement import Refinement, bring_depth, depth_misfit
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.fusion.tracks import Tracks
 from freegeo.guarded import scene_matches
 from freegeo.models.precision import choose_device
-from freegeo.types import PhotoLike
+from freegeo.types import PhotoLike, Priors
 
 if TYPE_CHECKING:
     from freegeo.data.photos import PhotoSource
@@ -36,9 +37,10 @@ class Refined:
     """Points that were measured in the photos, in the result's frame; None where the refinement is refused."""
     about: dict[str, Any]
     """JSON-like: `accepted`, `reason` (a sentence), `lacking` (what a refused one lacks: `matches` to begin with, a
-    `fit` of matches and prediction, or `proof` by held-out pairs), `probability`, `pairs`, and scores `frozen`,
-    `before`, `after` as `Measurement.as_dict`. The epipolar error of `after` is that of pairs that had no part in the
-    adjustment."""
+    `fit` of matches and prediction, or `proof` by held-out pairs), `probability`, `pairs`, `told` (whether depth is
+    that of a second prediction, told the refined cameras), `misfit` of both predictions' depth (`depth_misfit`), and
+    scores `frozen`, `before`, `after` as `Measurement.as_dict`. The epipolar error of `after` is that of pairs that had
+    no part in the adjustment."""
 
 
 def refine(
@@ -81,6 +83,7 @@ def refine_by_photos(
     frozen: Reconstruction | None = None,
     store: Path | None = None,
     device: str = "cpu",
+    again: Callable[[Priors], Reconstruction | None] | None = None,
 ) -> Refined:
     """Refine a prediction by matches between its photos, or say why not; bad input is no error.
 
@@ -91,6 +94,8 @@ def refine_by_photos(
             scores compared on the surfaces that it sees.
         store: file for the matches; None: they are not stored.
         device: where depth maps are compared.
+        again: predicts the same photos once more, told the refined cameras; None when it has no usable answer. Its
+            depth is taken where the measured points fit it better. None: the prediction's depth is used.
     """
     if not prediction.has_cameras:
         return _refused(prediction, "The model predicts no cameras, so there are none to refine.")
@@ -106,11 +111,30 @@ def refine_by_photos(
     }
     if frozen is not None:
         scores["frozen"] = reference.measure(reference.candidate).as_dict()
-    result = prediction
+    result, depth = prediction, {"told": False, "misfit": None}
     if found.accepted:
-        result, _ = bring_depth(prediction, found)
+        source, depth = _better_depth(prediction, found, again)
+        result, _ = bring_depth(source, found)
         scores["after"] = reference.measure(Candidate.of(result, device)).as_dict() | (scores["after"] or {})
-    return Refined(result=result, tracks=found.tracks if found.accepted else None, about=_about(found, scores))
+    return Refined(
+        result=result, tracks=found.tracks if found.accepted else None, about=_about(found, {**scores, **depth})
+    )
+
+
+def _better_depth(
+    prediction: Reconstruction, found: Refinement, again: Callable[[Priors], Reconstruction | None] | None
+) -> tuple[Reconstruction, dict[str, Any]]:
+    """Return the prediction whose depth the measured points fit better, and facts about that."""
+    misfit = [depth_misfit(prediction, found)]
+    if again is not None:
+        assert found.T_cam_world is not None and found.K is not None
+        T_cam_world, K = (torch.from_numpy(value).double()[None] for value in (found.T_cam_world, found.K))
+        second = again(Priors(T_cam_world=T_cam_world, K=K))
+        if second is not None:
+            misfit.append(depth_misfit(second, found))
+            if misfit[1] < misfit[0]:
+                return replace(second, scale=prediction.scale), {"told": True, "misfit": misfit}
+    return prediction, {"told": False, "misfit": misfit}
 
 
 def _refused(prediction: Reconstruction, reason: str) -> Refined:
@@ -124,7 +148,7 @@ def _about(found: Refinement, scores: dict[str, Any]) -> dict[str, Any]:
         "lacking": None if found.accepted else _lacking(found),
         "probability": found.probability,
         "pairs": 0 if found.pairs is None else len(found.pairs),
-        "frozen": None, "before": None, "after": None, **scores,
+        "told": False, "misfit": None, "frozen": None, "before": None, "after": None, **scores,
     }  # fmt: skip
 
 

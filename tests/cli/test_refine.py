@@ -116,9 +116,10 @@ def test_a_refined_reconstruction_is_the_result_and_can_be_taken_back(freegeo, r
     assert "refined already" in freegeo("refine", out, "-o", tmp_path / "twice").sentence()
 
     # Neither the network nor the matcher is asked again.
-    monkeypatch.setattr("freegeo.models.catalog.load_model", None)
     monkeypatch.setattr("freegeo.evidence.matches._matched", None)
-    assert freegeo(*command, "off").code == 0
+    with monkeypatch.context() as patch:
+        patch.setattr("freegeo.models.catalog.load_model", None)
+        assert freegeo(*command, "off").code == 0
     assert np.array_equal(cameras(out), before)
     assert "Observations are re-projections" in (out / "colmap/README.txt").read_text()
     assert not (out / "tracks.npz").exists() and not (out / "unrefined").exists()

@@ -473,3 +473,36 @@ def test_gates_shrink_to_the_last():
     assert gates == [128, 32, 8, 2]
     assert BundleSettings().gates_px(np.array([[10, 12]])) == [2]
     assert cluster(join_matches(exact()), VIEWS, 8).all()
+
+
+# -- depth of a second prediction
+
+
+@pytest.mark.parametrize(("second", "told"), [("exact", True), ("worse", False), (None, False)])
+def test_the_depth_that_the_measured_points_fit_better_is_used(monkeypatch, second, told):
+    from freegeo.refined import refine_by_photos
+
+    exact, matches = scene(), matched(scene())
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(exact.depth_z.shape, generator=generator).numpy()
+    T = turned(torch.from_numpy(exact.T_cam_world).double(), 2).float().numpy()
+    first = replace(exact, depth_z=exact.depth_z * np.exp(0.05 * noise), T_cam_world=T)
+    # Another factor in each view, which has no say.
+    factors = np.linspace(0.5, 2, VIEWS, dtype=np.float32)[:, None, None]
+    answers = {"exact": exact.depth_z * factors, "worse": exact.depth_z * factors * np.exp(0.1 * noise)}
+    monkeypatch.setattr("freegeo.refined.scene_matches", lambda *arguments, **options: matches)
+    asked = []
+
+    def again(priors):
+        asked.append(priors)
+        return None if second is None else replace(first, depth_z=answers[second].astype(np.float32))
+
+    found = refine_by_photos(first, [], again=again)
+    assert found.about["accepted"] and found.about["told"] is told
+    assert asked[0].whole_cameras
+    np.testing.assert_allclose(asked[0].T_cam_world[0].numpy(), found.result.T_cam_world, atol=1e-6)
+    wanted, factor = (answers["exact"] if told else first.depth_z), found.result.depth_z
+    ratio = factor / wanted
+    np.testing.assert_allclose(ratio, ratio[:, :1, :1] * np.ones_like(ratio), rtol=1e-4)
+    assert len(found.about["misfit"]) == (1 if second is None else 2)
+    assert (found.about["misfit"][-1] < found.about["misfit"][0]) is told

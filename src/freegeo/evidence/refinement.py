@@ -23,7 +23,7 @@ from freegeo.fusion.tracks import Tracks
 from freegeo.geometry.depth import valid_depth
 from freegeo.geometry.se3 import inverse, relative, transform_points
 
-__all__ = ["RefineSettings", "Refinement", "bring_depth", "parallax_px", "refine"]
+__all__ = ["RefineSettings", "Refinement", "bring_depth", "depth_misfit", "parallax_px", "refine"]
 
 logger = logging.getLogger(__name__)
 
@@ -220,6 +220,24 @@ def bring_depth(
         )  # fmt: skip
     moved = replace(reconstruction, depth_z=depth_z, T_cam_world=T_cam_world.astype(np.float32), K=K.astype(np.float32))
     return moved, without
+
+
+def depth_misfit(reconstruction: Reconstruction, refinement: Refinement) -> float:
+    """How badly predicted depth fits the tracks of an accepted refinement, whatever the factor of each view.
+
+    Mean over the views with 5 tracks and more of the median absolute deviation of log(depth of a track / predicted
+    depth); nan without such a view.
+    """
+    tracks, T_cam_world = refinement.tracks, refinement.T_cam_world
+    assert tracks is not None and T_cam_world is not None
+    measured, predicted = _depths(reconstruction, tracks, T_cam_world)
+    log = np.log(measured / predicted)
+    found = []
+    for view in range(len(reconstruction)):
+        own = log[(tracks.view == view) & np.isfinite(log)]
+        if len(own) >= FEWEST_DEPTHS:
+            found.append(np.median(np.abs(own - np.median(own))))
+    return float(np.mean(found)) if found else float("nan")
 
 
 def _before(start: Candidate, matches: Matches, tracks: MeasuredTracks, settings: RefineSettings) -> str | None:
