@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import freegeo
 from exact_rooms import room
@@ -371,6 +372,22 @@ def test_everything_known_is_in_the_fingerprint(photos):
     ]  # fmt: skip
     assert len({digest(known), *map(digest, others)}) == len(others) + 1
     assert digest(replace(known, source="elsewhere")) == digest(known)
+
+
+def test_photos_with_distortion_are_undistorted_once_and_written_so(photos, tmp_path):
+    pytest.importorskip("cv2")
+    known = known_for(photos)
+    bent = replace(known, cameras=tuple(replace(c, lens=Lens("SIMPLE_RADIAL", (-0.2,))) for c in known.cameras))
+    with pytest.raises(UserError, match="Undistort them, and use the new photos"):
+        freegeo.reconstruct(tiny_da3(), photos, cameras=bent, trust_cameras=True)
+    straight, pinholes = known_cameras(photos, bent)
+    result = freegeo.reconstruct(tiny_da3(), straight, cameras=pinholes, trust_cameras=True)
+    result.export(tmp_path, ["nerfstudio"], photos=straight)
+    _, K = read_nerfstudio(tmp_path)
+    for view, photo in enumerate(straight):
+        np.testing.assert_allclose(K[view], photo.K, atol=1e-9)
+        written = np.asarray(Image.open(tmp_path / "images" / f"{photo.name}.png"))
+        assert np.array_equal(written, photo.read()) and not np.array_equal(written, photos[view].read())
 
 
 def test_masks_follow_their_undistorted_photos(photos):

@@ -246,10 +246,18 @@ def reconstruct(
 def _with_cameras(
     photos: Sequence[PhotoLike], cameras: KnownCameras | str | Path | None, *, trust: bool
 ) -> tuple[Sequence[PhotoLike], KnownCameras | None]:
-    """Return the photos, undistorted, with their cameras, which are checked unless they are trusted."""
+    """Return the photos with their cameras, which are checked unless they are trusted.
+
+    UserError for distortion: exports write the photos that they are given, which would be the caller's distorted ones.
+    """
     if cameras is None:
         return photos, None
-    photos, known = known_cameras(photos, cameras)
+    seen, known = known_cameras(photos, cameras)
+    if any(new is not old for new, old in zip(seen, photos, strict=True)):
+        raise UserError(
+            f"{known.source}: the photos have distortion. Undistort them, and use the new photos from then on: photos, "
+            "known = freegeo.cameras.undistortion.undistorted(photos, known)."
+        )
     if not trust:
         check_known(known, photos)
     return photos, known

@@ -14,6 +14,8 @@ from freegeo.data.procedural import render, sample_rooms
 from freegeo.export.pixels import corner_K
 from freegeo.export.reconstruction import Reconstruction
 
+LITTLE = ["--formats", "npz"]
+
 
 @pytest.fixture(scope="module")
 def known() -> KnownCameras:
@@ -43,7 +45,7 @@ def test_run_returns_the_given_cameras_and_keeps_what_the_model_predicted(
     freegeo, photo_folder, tiny, file, known, tmp_path
 ):
     out = tmp_path / "out"
-    command = ["run", photo_folder, "-o", out, *tiny, *QUICK, "--cameras", file, "--trust-cameras", "--metric"]
+    command = ["run", photo_folder, "-o", out, *tiny, *QUICK, *LITTLE, "--cameras", file, "--trust-cameras", "--metric"]
     outcome = freegeo(*command)
     assert outcome.code == 0, outcome.err
     assert "is told the cameras of" in outcome.err
@@ -68,7 +70,7 @@ def test_run_returns_the_given_cameras_and_keeps_what_the_model_predicted(
 
 def test_other_cameras_are_another_run_where_the_model_is_told_them(freegeo, photo_folder, tiny, file, known, tmp_path):
     out = tmp_path / "out"
-    command = ["run", photo_folder, "-o", out, *tiny, *QUICK, "--trust-cameras"]
+    command = ["run", photo_folder, "-o", out, *tiny, *QUICK, *LITTLE, "--trust-cameras"]
     assert freegeo(*command, "--cameras", file).code == 0
     other = tmp_path / "other.json"
     moved = known.cameras[0].T_cam_world.copy()
@@ -89,7 +91,7 @@ def test_other_cameras_are_another_run_where_the_model_is_told_them(freegeo, pho
 
 def test_shared_focal_lengths_and_back(freegeo, photo_folder, tiny, tmp_path):
     out = tmp_path / "out"
-    command = ["reconstruct", photo_folder, "-o", out, *tiny]
+    command = ["reconstruct", photo_folder, "-o", out, *tiny, *LITTLE]
     assert freegeo(*command).code == 0
     plain = Reconstruction.load(out)
     assert freegeo(*command, "--one-camera").code == 0
@@ -141,4 +143,4 @@ def test_wrongly_read_cameras_are_refused_and_leave_no_folder(freegeo, tmp_path,
     assert outcome.code == 2 and "--cameras-convention c2w-opencv" in outcome.sentence()
     assert not out.exists()
     right = ["--cameras", tmp_path / "wrong.json", "--cameras-convention", "c2w-opencv"]
-    assert freegeo("reconstruct", photos, "-o", out, *tiny, *right).code == 0
+    assert freegeo("reconstruct", photos, "-o", out, *tiny, *LITTLE, *right).code == 0

@@ -268,7 +268,7 @@ def describe(summary: dict[str, Any], folder: Path) -> None:
     if summary["scale"]:
         spread = summary["scale"]["spread"]
         certain = "" if spread is None else f", to {100 * spread:.2g} %"
-        console.say(f"lengths are metres (from {summary['scale']['source']}{certain})")
+        console.say(f"lengths are metres (from {summary['scale']['source']}){certain}")
     if summary["loss"]:
         first, last = summary["loss"]["first"], summary["loss"]["last"]
         console.say(f"adaptation loss {first:.4f} -> {last:.4f} (means of the first and last tenth of the steps)")
