@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "src" / "freegeo"
-ANYWHERE = {"types", "errors", "files", "run_folder", "__init__"}
+ANYWHERE = {"types", "errors", "files", "lock", "run_folder", "__init__"}
 ALLOWED = {
     "pipeline": {
         *("models", "data", "adaptation", "evidence", "fusion", "export", "report", "metrics", "geometry", "progress"),
@@ -24,7 +24,7 @@ ALLOWED = {
     "adaptation": {"models", "data.scene", "geometry"},
     "evidence": {"export", "fusion", "metrics", "geometry"},
     "report": {"evidence", "export", "metrics", "geometry"},
-    "export": {"fusion", "geometry"},
+    "export": {"data.image_files", "fusion", "geometry"},
     "fusion": {"geometry"},
     "metrics": {"data.scene", "geometry"},
     "data": {"geometry"},
@@ -34,6 +34,7 @@ ALLOWED = {
     "types": set(),
     "errors": set(),
     "files": set(),
+    "lock": set(),
     "run_folder": set(),
     "__init__": set(),
 }
@@ -129,3 +130,16 @@ def test_the_rule_finds_what_breaks_it():
         "import scipy\nif TYPE_CHECKING:\n    import cv2\ndef f():\n    import peft\nclass C:\n    import av\n"
     )
     assert {name for node in at_import_time(tree) for name in imported(node)} == {"scipy", "av"}
+
+
+DOORS = {"Image.open": "data/image_files.py", "av.open": "data/video.py", "trimesh.load": "fusion/mesh.py"}
+"""Readers that start programs, or open other files and addresses, unless they are limited: each is called once."""
+
+
+def calls_of(name: str, tree: ast.Module) -> int:
+    return sum(isinstance(node, ast.Call) and ast.unparse(node.func).startswith(name) for node in ast.walk(tree))
+
+
+@pytest.mark.parametrize("name", DOORS)
+def test_files_from_elsewhere_are_opened_in_one_place(name):
+    assert {name_of(file): n for file in FILES if (n := calls_of(name, tree_of(file)))} == {DOORS[name]: 1}

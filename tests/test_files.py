@@ -10,6 +10,7 @@ import torch
 from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import LEDGER_FILE, atomic_folder, atomic_path, inside, keep_ledger, ledger, remove_written
+from freegeo.lock import LOCK_FILE, locked
 
 
 def names_in(folder: Path) -> set[str]:
@@ -143,6 +144,30 @@ def test_a_stop_between_old_and_new_never_leaves_a_mixture(tmp_path, monkeypatch
     assert (tmp_path / "model" / "a.bin").read_text() == "new"
 
 
+def test_a_scratch_folder_is_empty_and_what_a_killed_process_left_in_it_goes(tmp_path):
+    out = tmp_path / "out"
+    keep_ledger(out)
+    folder = files.scratch_folder(out / "adapter", "samples")
+    (folder / "0.bin").write_text("")
+    assert list(files.scratch_folder(out / "adapter", "samples").iterdir()) == []
+    (folder / "0.bin").write_text("")
+    files.remove_parts(out)
+    assert names_in(out) == {LEDGER_FILE}
+    assert not (out / "adapter").exists()
+
+
+def test_a_scratch_folder_is_made_in_a_folder_and_not_outside(tmp_path):
+    out = tmp_path / "out"
+    keep_ledger(out)
+    (tmp_path / "outside").mkdir()
+    (out / "link").symlink_to(tmp_path / "outside")
+    (out / "file").write_text("")
+    for place, sentence in (("link", "leads out of the output folder"), ("file", "cannot be written to")):
+        with pytest.raises(UserError, match=sentence):
+            files.scratch_folder(out / place, "samples")
+    assert list((tmp_path / "outside").iterdir()) == []
+
+
 # -- the ledger, and places outside the folder
 
 
@@ -173,7 +198,10 @@ def test_names_with_odd_characters_come_back_from_the_ledger(tmp_path):
     assert names_in(tmp_path) == {LEDGER_FILE}
 
 
-@pytest.mark.parametrize("name", ["", ".", "..", "../a", "a/../../b", "/etc/a", "a\nb", "a\x00b", "a\rb"])
+@pytest.mark.parametrize(
+    "name",
+    ["", ".", "..", "../a", "a/../../b", "/etc/a", "a\nb", "a\x00b", "a\rb", "a/../b", "\ud800.png", "d" * 256 + "/a"],
+)
 def test_names_that_lead_out_are_refused(tmp_path, name):
     with pytest.raises(UserError, match="cannot be the name of a file below"):
         inside(tmp_path, name)
@@ -182,6 +210,26 @@ def test_names_that_lead_out_are_refused(tmp_path, name):
 def test_names_that_only_look_odd_are_not(tmp_path):
     for name in ("a/b.png", "..a", "a..b/c", "~", "-x"):
         assert inside(tmp_path, name).is_relative_to(tmp_path)
+
+
+@pytest.mark.parametrize("own", [LEDGER_FILE, LOCK_FILE])
+@pytest.mark.parametrize("exists", [True, False])
+def test_own_files_that_are_links_are_not_written_through(tmp_path, own, exists):
+    out, victim = tmp_path / "out", tmp_path / "victim"
+    out.mkdir()
+    (out / own).symlink_to(victim)
+    if exists:
+        victim.write_text("mine")
+
+    def write():
+        with locked(out):
+            keep_ledger(out)
+            files.write_json(out / "a.json", 1)
+
+    with pytest.raises(UserError, match=f"{own}: is a symbolic link"):
+        write()
+    assert victim.exists() == exists
+    assert not exists or victim.read_text() == "mine"
 
 
 @pytest.mark.parametrize("way", ["link", "link above", "dots"])
@@ -213,6 +261,19 @@ def test_a_folder_that_became_a_link_is_not_followed_when_files_are_removed(tmp_
     (out / "maps").symlink_to(outside)
     remove_written(out / "maps")
     assert names_in(outside) == {"a.json"}
+
+
+def test_an_empty_folder_behind_a_link_stays(tmp_path):
+    out, outside = tmp_path / "out", tmp_path / "outside"
+    (outside / "sub").mkdir(parents=True)
+    keep_ledger(out)
+    files.write_json(out / "a.json", 1)
+    (out / "link").symlink_to(outside)
+    with (out / LEDGER_FILE).open("a") as file:
+        file.write("link/sub/x\nlink/sub\nlink\n")
+    remove_written(out / "link")
+    assert (outside / "sub").is_dir()
+    assert not (out / "link").is_symlink()
 
 
 def test_links_and_ways_inside_the_folder_are_allowed(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,8 +12,10 @@ import pytest
 
 from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import LEDGER_FILE, LOCK_FILE, RUN_FILE, atomic_path, write_json
-from freegeo.run_folder import Part, check_folder, difference, locked, run_folder
+from freegeo.files import LEDGER_FILE, RUN_FILE, atomic_path, write_json
+from freegeo.lock import LOCK_FILE, locked
+from freegeo.run_folder import Part, check_folder, difference, run_folder
+from test_lock import child
 
 SETTINGS = {"model": "tiny", "recipe": {"steps": 2, "keep": (0, 2)}, "seed": 1}
 HIDDEN = {RUN_FILE, LOCK_FILE, LEDGER_FILE}
@@ -28,51 +31,6 @@ def result(folder: Path, settings=SETTINGS, text="first", **options) -> None:
         write_json(run / "result.json", text)
         write_json(run / "deep" / "part.json", text)
         run.finish()
-
-
-def child(code: str) -> subprocess.Popen:
-    """Start Python on a few lines; it says READY when they have got that far."""
-    code = "import time\nfrom pathlib import Path\n" + code
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "READY\n"
-    return process
-
-
-# -- lock
-
-
-def test_second_process_is_refused_and_the_lock_dies_with_its_holder(tmp_path):
-    code = f"""
-from freegeo.run_folder import locked
-with locked(Path({str(tmp_path)!r})):
-    print("READY", flush=True)
-    time.sleep(60)
-"""
-    holder = child(code)
-    try:
-        with pytest.raises(UserError, match="another freegeo process"), locked(tmp_path):
-            pass
-    finally:
-        holder.send_signal(signal.SIGKILL)
-        holder.wait()
-    with locked(tmp_path):
-        assert (tmp_path / LOCK_FILE).exists()
-    assert not (tmp_path / LOCK_FILE).exists()
-
-
-def test_lock_is_released_after_an_error(tmp_path):
-    with pytest.raises(RuntimeError), locked(tmp_path):
-        raise RuntimeError
-    with locked(tmp_path):
-        pass
-
-
-@pytest.mark.parametrize("place", ["file", "file/below"])
-def test_lock_in_a_place_that_is_no_folder(tmp_path, place):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot be written to"), locked(tmp_path / place):
-        pass
 
 
 # -- run folders
@@ -396,3 +354,238 @@ def test_a_block_that_is_refused_while_it_writes_leaves_no_trace(tmp_path):
     with pytest.raises(UserError, match="no"), run_folder(out, SETTINGS), atomic_path(out / "a.txt"):
         raise UserError("no")
     assert not (tmp_path / "out").exists()
+
+
+# -- a folder that is changed behind its holder's back
+
+
+def deleted(out: Path) -> None:
+    shutil.rmtree(out)
+
+
+def made_anew(out: Path) -> None:
+    shutil.rmtree(out)
+    out.mkdir()
+
+
+def moved_away(out: Path) -> None:
+    out.rename(out.with_name("moved"))
+
+
+def replaced_by_a_link(out: Path) -> None:
+    out.rename(out.with_name("moved"))
+    (out.parent / "other").mkdir()
+    out.symlink_to(out.parent / "other")
+
+
+def made_anew_by_another_process(out: Path) -> None:
+    shutil.rmtree(out)
+    holder = child(f"""
+import os
+from freegeo.run_folder import run_folder
+with run_folder(Path({str(out)!r}), {{"other": 1}}) as run:
+    print("READY", flush=True)
+    os.kill(os.getpid(), 9)
+""")
+    holder.wait()
+
+
+TAKEN_AWAY = (deleted, made_anew, moved_away, replaced_by_a_link, made_anew_by_another_process)
+DOES = {
+    "file": lambda run: write_json(run / "b.json", 1),
+    "folder": lambda run: files.atomic_folder(run / "model").__enter__(),
+    "removal": lambda run: files.remove_file(run / "a.json"),
+    "note": lambda run: run.note("x", 1),
+    "finish": lambda run: run.finish(),
+}
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.mark.parametrize("taken_away", TAKEN_AWAY)
+@pytest.mark.parametrize("does", DOES)
+def test_a_run_whose_folder_is_taken_away_stops_and_changes_nothing_there(tmp_path, taken_away, does):
+    out = tmp_path / "out"
+    gone = pytest.raises(FreeGeoError, match="was removed or replaced while freegeo was writing")
+    with gone, run_folder(out, SETTINGS) as run:
+        write_json(run / "a.json", 1)
+        taken_away(out)
+        there = tree(tmp_path)
+        DOES[does](run)
+    assert tree(tmp_path) == there
+    assert out.exists() == (taken_away not in (deleted, moved_away))
+
+
+def test_a_folder_that_vanishes_while_a_file_is_written(tmp_path):
+    out = tmp_path / "out"
+    gone = pytest.raises(FreeGeoError, match="was removed or replaced")
+    with gone, run_folder(out, SETTINGS) as run, atomic_path(run / "a.txt") as part:
+        part.write_text("half")
+        shutil.rmtree(out)
+    assert not out.exists()
+
+
+def test_two_writers_are_impossible_after_a_re_creation(tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(FreeGeoError, match="was removed or replaced"), run_folder(out, SETTINGS) as run:
+        shutil.rmtree(out)
+        code = f"""
+from freegeo.run_folder import run_folder
+with run_folder(Path({str(out)!r}), {{"other": 1}}) as run:
+    print("READY", flush=True)
+    time.sleep(60)
+"""
+        second = child(code)
+        try:
+            before = tree(out)
+            write_json(run / "a.json", 1)
+        finally:
+            after = tree(out)
+            with pytest.raises(UserError, match="another freegeo process"), locked(out):
+                pass
+            second.kill()
+            second.wait()
+    assert after == before
+    assert (out / LOCK_FILE).exists(), "the first must not remove the lock of the second"
+
+
+@pytest.mark.parametrize("name", ["frozen/a.json", LEDGER_FILE, RUN_FILE])
+def test_a_result_that_lost_a_file_is_not_finished_and_the_same_run_repairs_it(tmp_path, name):
+    def run_it(lose: bool) -> None:
+        with run_folder(tmp_path, SETTINGS) as run:
+            for own in ("frozen/a.json", "b.json"):
+                if not (run / own).is_file():
+                    write_json(run / own, own)
+            if lose:
+                (tmp_path / name).unlink()
+            run.finish()
+
+    with pytest.raises(FreeGeoError, match=r"was removed while freegeo was writing there.*run the command again"):
+        run_it(lose=True)
+    if name != RUN_FILE:
+        run_it(lose=False)
+        assert visible(tmp_path) == {"frozen/a.json", "b.json"}
+
+
+def test_what_the_run_removes_itself_is_not_missed(tmp_path):
+    with run_folder(tmp_path, SETTINGS) as run:
+        for name in ("a.json", "deep/b.json", "c.json", "model/d.json"):
+            write_json(run / name, 1)
+        files.remove_file(run / "a.json")
+        files.remove_written(run / "deep")
+        with files.atomic_folder(run / "model") as part:
+            (part / "e.json").write_text("1")
+        run.finish()
+    assert visible(tmp_path) == {"c.json", "model/e.json"}
+
+
+def test_files_that_a_run_would_take_for_its_own_are_in_the_way(tmp_path):
+    """Without its ledger a run does not know what it wrote: it must not label an adapter of before as a new one."""
+    staged(tmp_path)
+    (tmp_path / LEDGER_FILE).unlink()
+    other = {**STAGED, "train": {"lr": 2}}
+    in_the_way = pytest.raises(UserError, match=r"adapter/weights: freegeo did not write it")
+    with in_the_way, run_folder(tmp_path, other, parts=PARTS, overwrite=True):
+        pass
+    assert visible(tmp_path) == STAGED_FILES
+
+
+def test_what_a_killed_run_kept_on_disk_is_not_in_the_way(tmp_path):
+    staged(tmp_path, finish=False)
+    (files.scratch_folder(tmp_path / "adapter", "samples") / "0.bin").write_text("")
+    with run_folder(tmp_path, {**STAGED, "train": {"lr": 2}}, parts=PARTS, overwrite=True):
+        assert visible(tmp_path) == set()
+        assert not (tmp_path / "adapter").exists()
+
+
+# -- killed at any moment
+
+DRIVER = """
+import json, os, shutil, sys
+from pathlib import Path
+from freegeo.files import atomic_folder, write_json
+from freegeo.run_folder import Part, run_folder
+
+PARTS = (Part("train", ("adapter/",)), Part("filter", ("",), free=True))
+EVENTS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.utime", "os.chmod"}
+place, step = Path(sys.argv[1]), int(sys.argv[2])
+os.fsync = lambda file: None  # only the order of operations matters here
+
+def command(out, train, share, overwrite=False):
+    with run_folder(out, {"train": train, "filter": share}, parts=PARTS, overwrite=overwrite) as run:
+        if run.finished:
+            return
+        if not (run / "adapter/weights.json").is_file():
+            write_json(run / "adapter/weights.json", train)
+            run.note("train", train)
+        with atomic_folder(run / "model") as part:
+            (part / "a.bin").write_text(f"{train} {share}")
+            (part / f"{share}.bin").write_text("x")
+        write_json(run / "points.json", [train, share])
+        run.finish()
+
+def tree(out):
+    names = {p.relative_to(out).as_posix(): p for p in out.rglob("*") if p.name != ".freegeo-files"}
+    return {name: json.loads(p.read_text())["settings"] if p.name == ".freegeo-run.json" else p.read_text()
+            for name, p in names.items() if p.is_file()}
+
+def in_child(work, kill_at=None):
+    child = os.fork()
+    if child == 0:
+        count = [0]
+        def hook(event, arguments):
+            if event in EVENTS and str(place) in str(arguments[0]):
+                count[0] += 1
+                if count[0] == kill_at:
+                    os.kill(os.getpid(), 9)
+        if kill_at:
+            sys.addaudithook(hook)
+        try:
+            work()
+        except BaseException as error:
+            print("FAILED", repr(error), file=sys.stderr, flush=True)
+            os._exit(1)
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+stages = {
+    "first": lambda out: command(out, 1, 1),
+    "free part": lambda out: command(out, 1, 2),
+    "overwrite": lambda out: command(out, 2, 2, overwrite=True),
+}
+told = {}
+before = None
+for number, (name, stage) in enumerate(stages.items()):
+    whole = place / f"{number}-whole"
+    if before:
+        shutil.copytree(before, whole)
+    in_child(lambda: stage(whole))
+    points = int(sys.argv[3]) - step
+    while True:
+        points += step
+        out = place / f"{number}-{points}"
+        if before:
+            shutil.copytree(before, out)
+        if in_child(lambda: stage(out), kill_at=points) == 0:
+            break
+        code = in_child(lambda: stage(out))
+        if code or tree(out) != tree(whole):
+            print(json.dumps([name, points, code, sorted(tree(out))]))
+            sys.exit("not as without the kill")
+    told[name] = points // step
+    before = whole
+print(json.dumps(told))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.parametrize("step", [pytest.param(1, marks=pytest.mark.slow), 8])
+def test_a_kill_at_any_operation_is_followed_by_the_same_result(tmp_path, step):
+    """Each operation on a file of a run, of a change of a free part, and of `overwrite`; every `step`-th of them."""
+    arguments = [sys.executable, "-c", DRIVER, str(tmp_path), str(step), str(min(step, 5))]
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    kills = json.loads(done.stdout)
+    assert min(kills.values()) * step >= 56, kills

@@ -17,5 +17,9 @@ class DivergedError(FreeGeoError):
     """An adaptation whose loss or gradient is not finite, or has grown beyond recovery: it has no result."""
 
 
+class LostFolderError(FreeGeoError):
+    """An output folder that was removed or changed while a command was writing there: the command ends at once."""
+
+
 class NoEvidenceError(FreeGeoError):
     """A scene whose matches between photos prove no cameras, where these are to be learned from."""

@@ -18,15 +18,17 @@ from pathlib import Path
 from typing import Any
 
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.lock import LOCK_FILE, Lock, note_removed, note_written, require_lock, require_no_link
 
 FORMAT = 1
 """Version of the files that freegeo writes."""
 RUN_FILE = ".freegeo-run.json"
-LOCK_FILE = ".freegeo-lock"
 LEDGER_FILE = ".freegeo-files"
 OWN_FILES = frozenset({RUN_FILE, LOCK_FILE, LEDGER_FILE})
 NAME_MAX = 255
 """Longest name of a file in bytes, on every common file system."""
+_SHOWN = 80
+"""Most characters of an odd name that a message shows."""
 _PART = re.compile(r"\..+\.[0-9a-f]{8}\.part(\..*)?")
 
 
@@ -35,14 +37,16 @@ def atomic_path(path: Path) -> Generator[Path]:
     """Give a temporary path beside `path` to write to; it takes the final name only when the block succeeds.
 
     The temporary name keeps the suffix, since writers choose the format by it. UserError when the folder cannot be
-    written to, or when `path` leads out of the output folder; an OSError while writing, such as a full disk, names the
-    final path.
+    written to, or when `path` leads out of the output folder; LostFolderError when that folder was locked and is gone;
+    an OSError while writing, such as a full disk, names the final path.
     """
     with _door(path, path.parent) as part:
         yield part
         _flush(part)
+        require_lock(path)
         _enter_in_ledger([path])
         part.replace(path)
+        note_written(path)
 
 
 @contextmanager
@@ -60,19 +64,18 @@ def atomic_folder(path: Path) -> Generator[Path]:
             _flush(part / name)
         remove_written(path)
         for name in new:
-            (path / name).unlink(missing_ok=True)
+            remove_file(path / name)
         _enter_in_ledger([path / name for name in new])
         for name in new:
             (path / name).parent.mkdir(parents=True, exist_ok=True)
             (part / name).replace(path / name)
+            note_written(path / name)
 
 
 @contextmanager
 def _door(path: Path, folder: Path) -> Generator[Path]:
     """Give the temporary path for what will be `path`, and remove it afterwards; `folder` is where files are put."""
-    owner = _owner(path)
-    if owner is not None and path.name not in OWN_FILES and not _is_below(folder, owner):
-        raise UserError(f"{path}: leads out of the output folder {owner}. Remove the symbolic link, or the '..'.")
+    _require_own(path, folder)
     # Short, so that it fits wherever the final name does.
     part = path.with_name(f".{path.stem[:40]}.{secrets.token_hex(4)}.part{path.suffix[:20]}")
     try:
@@ -83,6 +86,7 @@ def _door(path: Path, folder: Path) -> Generator[Path]:
     except PermissionError:
         raise UserError(f"{path.parent}: the folder cannot be written to. Choose another output folder.") from None
     except OSError as error:
+        require_lock(path)
         if error.errno is None:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
@@ -90,11 +94,43 @@ def _door(path: Path, folder: Path) -> Generator[Path]:
         _remove(part)
 
 
+def scratch_folder(parent: Path, name: str) -> Path:
+    """Make an empty folder for what a command needs while it runs; the next run removes what a killed one left in it.
+
+    Errors as `atomic_path`.
+    """
+    folder = parent / f".{name}.{0:08x}.part"
+    _require_own(folder, parent)
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        _enter_in_ledger([folder])
+        _remove(folder)
+        folder.mkdir()
+    except OSError as error:
+        raise UserError(f"{parent}: cannot be written to ({error.strerror}). Choose another output folder.") from None
+    return folder
+
+
+def _require_own(path: Path, folder: Path) -> None:
+    """Refuse a path whose `folder` is not below the output folder, or whose output folder is gone."""
+    require_lock(path)
+    owner = _owner(path)
+    if owner is not None and path.name not in OWN_FILES and not _is_below(folder, owner):
+        raise UserError(f"{path}: leads out of the output folder {owner}. Remove the symbolic link, or the '..'.")
+
+
 def _remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file that freegeo wrote, if it is there; LostFolderError when its folder was locked and is gone."""
+    require_lock(path)
+    path.unlink(missing_ok=True)
+    note_removed(path)
 
 
 def _flush(path: Path) -> None:
@@ -112,9 +148,21 @@ def inside(folder: Path, name: str) -> Path:
     Every name that comes from outside, such as a photo's, goes through here before it becomes a path.
     """
     path = Path(name)
-    if not path.name or path.is_absolute() or path.drive or ".." in path.parts or re.search(r"[\x00\r\n]", name):
-        raise UserError(f"{name!r} cannot be the name of a file below {folder}. Rename the photo.")
+    if re.search(r"[\x00\r\n\ud800-\udfff]", name) or _leads_out(path) or not _fits(path.parent):
+        raise UserError(f"{_short(name)!r} cannot be the name of a file below {folder}. Rename the photo.")
     return folder / path
+
+
+def _leads_out(path: Path) -> bool:
+    return not path.name or path.is_absolute() or bool(path.drive) or ".." in path.parts
+
+
+def _fits(path: Path) -> bool:
+    return all(len(os.fsencode(part)) <= NAME_MAX for part in path.parts)
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= _SHOWN else f"{name[:_SHOWN]}..."
 
 
 def fitted(name: str) -> str:
@@ -132,19 +180,25 @@ def fitted(name: str) -> str:
 def keep_ledger(folder: Path) -> None:
     """Make a folder that notes down what is written below it; a part of an output folder does so already."""
     if _owner(folder / LEDGER_FILE) is None:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            (folder / LEDGER_FILE).touch()
-        except OSError as error:
-            raise UserError(f"{folder}: the folder cannot be written to ({error.strerror}). Choose another.") from None
+        start_ledger(folder)
+
+
+def start_ledger(folder: Path) -> None:
+    """Make a folder note down what is written below it, also inside another output folder."""
+    require_no_link(folder / LEDGER_FILE)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / LEDGER_FILE).touch()
+    except OSError as error:
+        raise UserError(f"{folder}: the folder cannot be written to ({error.strerror}). Choose another.") from None
 
 
 def ledger(folder: Path) -> list[str]:
     """Names of the files that freegeo wrote below an output folder, each once; the files need not exist any more."""
     file = folder / LEDGER_FILE
     text = file.read_text(encoding="utf-8", errors="surrogateescape") if file.is_file() else ""
-    names = dict.fromkeys(line for line in text.split("\n") if line)
-    return [name for name in names if ".." not in Path(name).parts and not Path(name).is_absolute()]
+    names = dict.fromkeys(line for line in text.split("\n") if line and "\0" not in line)
+    return [name for name in names if not _leads_out(path := Path(name)) and _fits(path)]
 
 
 def write_ledger(folder: Path, names: Iterable[str]) -> None:
@@ -171,11 +225,13 @@ def remove_written(place: Path, *, keep: Iterable[Path] = ()) -> None:
 
 def remove_listed(owner: Path, names: Iterable[str]) -> None:
     """Remove files of an output folder by their names in its ledger, and the folders that become empty."""
-    paths = [owner / name for name in names]
+    require_lock(owner / LEDGER_FILE)
+    # A folder that has become a link to another place is not followed.
+    paths = [path for name in names if _is_below((path := owner / name).parent, owner)]
     for path in paths:
-        # A folder that has become a link to another place is not followed.
-        if _is_below(path.parent, owner) and (path.is_symlink() or path.is_file() or is_part(path)):
+        if path.is_symlink() or path.is_file() or (path.is_dir() and is_part(path)):
             _remove(path)
+            note_removed(path)
     inner = {folder for path in paths for folder in path.parents if owner in folder.parents}
     for folder in sorted(inner, key=lambda f: len(f.parts), reverse=True):
         if folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir()):
@@ -190,6 +246,15 @@ def remove_parts(owner: Path) -> None:
 def is_part(path: Path) -> bool:
     """Whether a path has the name of something half-written."""
     return _PART.fullmatch(path.name) is not None
+
+
+def missing(lock: Lock) -> list[Path]:
+    """Return the files that the lock's holder wrote and that are gone, or are in no ledger any more."""
+    owners = {file: _owner(file) for file in lock.written if file.name not in OWN_FILES}
+    noted = {
+        owner: {owner.resolve() / name for name in ledger(owner)} for owner in owners.values() if owner is not None
+    }
+    return sorted(file for file, owner in owners.items() if not file.exists() or file not in noted.get(owner, ()))
 
 
 def _owner(path: Path) -> Path | None:
@@ -211,6 +276,7 @@ def _enter_in_ledger(paths: Iterable[Path]) -> None:
     for path in paths:
         owner = _owner(path)
         if owner is not None and path.name not in OWN_FILES:
+            require_no_link(owner / LEDGER_FILE)
             with (owner / LEDGER_FILE).open("a", encoding="utf-8", errors="surrogateescape") as file:
                 file.write(_entry(path, owner) + "\n")
 

@@ -1002,7 +1002,14 @@ def write_files(
         filtered = filter_reconstruction(result, masks=masks, settings=filters)
         save_kept(folder, filtered, masks)
     exported = export(
-        result, folder, formats, filtered=filtered, masks=masks, photos=photos, tracks=load_tracks(folder), seed=seed
+        result,
+        folder,
+        formats,
+        filtered=filtered,
+        masks=masks,
+        photos=photos,
+        tracks=load_tracks(folder, len(result)),
+        seed=seed,
     )
     return None if filtered is None else filtered[1], exported.failed
 

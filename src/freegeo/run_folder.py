@@ -20,70 +20,22 @@ from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import (
     FORMAT,
     LEDGER_FILE,
-    LOCK_FILE,
     OWN_FILES,
     RUN_FILE,
     as_json,
     is_part,
     ledger,
+    missing,
     read_json,
     remove_listed,
     remove_parts,
+    start_ledger,
     write_json,
     write_ledger,
 )  # fmt: skip
+from freegeo.lock import Lock, locked, lost
 
 _SHOWN = 4
-
-
-@contextmanager
-def locked(folder: Path) -> Generator[None]:
-    """Lock a folder against other processes; the system releases the lock when the process ends.
-
-    A folder that is made here and stays empty is removed again. UserError when the folder cannot be made or written
-    to, or when another process holds it.
-    """
-    lock = folder / LOCK_FILE
-    is_new = not folder.exists()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = lock.open("a+b")
-    except OSError as error:
-        raise UserError(
-            f"{folder}: the output folder cannot be written to ({error.strerror}). Choose another one."
-        ) from None
-    with handle:
-        # The previous holder may have removed the file between open and lock; such a lock would protect nothing.
-        if not _try_lock(handle) or not _is_same_file(handle, lock):
-            raise UserError(f"{folder}: another freegeo process is writing here. Wait for it or choose another folder.")
-        try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)
-            if is_new and not any(folder.iterdir()):
-                folder.rmdir()
-
-
-def _is_same_file(handle, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(handle.fileno()), path.stat())
-    except FileNotFoundError:
-        return False
-
-
-def _try_lock(handle) -> bool:
-    try:
-        if os.name == "nt":
-            import msvcrt
-
-            msvcrt.locking(handle.fileno(), msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
 
 
 @dataclass(frozen=True)
@@ -107,6 +59,7 @@ class RunFolder:
     """One command's output folder, locked while the command runs."""
 
     path: Path
+    lock: Lock
     settings: Mapping[str, Any]
     finished_at: str | None
     notes: dict[str, Any] = field(default_factory=dict)
@@ -127,10 +80,17 @@ class RunFolder:
         self._write(None)
 
     def finish(self) -> None:
-        """Mark the result as complete."""
+        """Mark the result as complete; LostFolderError when a file of it is gone, or not in the ledger any more."""
+        self.lock.require()
+        gone = missing(self.lock)
+        if gone:
+            raise lost(self.path, f"{gone[0].name}, or the list of what was written ({LEDGER_FILE}), was removed")
         self._write(datetime.now(UTC).isoformat(timespec="seconds"))
 
     def _write(self, finished: str | None) -> None:
+        self.lock.require()
+        if not (self.path / RUN_FILE).is_file():
+            raise lost(self.path, f"the state of the run ({RUN_FILE}) was removed")
         write_json(self.path / RUN_FILE, _state(self.settings, finished, self.notes))
 
 
@@ -161,33 +121,47 @@ def run_folder(
     """
     settings = as_json(settings)
     check_folder(path, settings, overwrite=overwrite, parts=parts, labels=labels)
-    with locked(path):
+    with locked(path) as lock:
         # The state is read again under the lock: another process may have changed it since the check.
         check_folder(path, settings, overwrite=overwrite, parts=parts, labels=labels)
-        folder = _open(path, settings, overwrite, parts)
+        folder = _open(lock, settings, overwrite, parts)
         try:
             yield folder
         except UserError:
-            if not any((path / name).exists() for name in ledger(path)):
+            if lock.is_held() and not any((path / name).exists() for name in ledger(path)):
                 (path / RUN_FILE).unlink(missing_ok=True)
                 (path / LEDGER_FILE).unlink(missing_ok=True)
             raise
 
 
-def _open(path: Path, settings: Mapping[str, Any], overwrite: bool, parts: Sequence[Part]) -> RunFolder:
+def _open(lock: Lock, settings: Mapping[str, Any], overwrite: bool, parts: Sequence[Part]) -> RunFolder:
     """Start or continue the run of a locked folder."""
+    path = lock.folder
     before, notes = stored_state(path), {}
+    if before is None:
+        # Before the state, so that a process that is killed while it writes that leaves nothing that is not listed.
+        start_ledger(path)
+    remove_parts(path)
     if before is not None:
         same = before["settings"] == settings
         if same and not overwrite:
-            if not before["finished"]:
-                remove_parts(path)
-            return RunFolder(path, settings, before["finished"], before.get("notes") or {})
+            return RunFolder(path, lock, settings, before["finished"], before.get("notes") or {})
         kept = [] if same else parts[: _unchanged(before["settings"], settings, parts)]
+        _require_free(path, [part for part in parts if part not in kept])
         clear(path, keep=lambda name: any(part.owns(name) for part in kept))
         notes = {part.name: before["notes"][part.name] for part in kept if part.name in (before.get("notes") or {})}
     write_json(path / RUN_FILE, _state(settings, None, notes))
-    return RunFolder(path, settings, None, notes)
+    return RunFolder(path, lock, settings, None, notes)
+
+
+def _require_free(path: Path, parts: Sequence[Part]) -> None:
+    """Refuse files of others in the places of a run's own, which it would take for what it had computed before."""
+    own = {path.resolve() / name for name in ledger(path)}
+    for name in (name for part in parts for name in part.files if name):
+        there = (path / name).rglob("*") if name.endswith("/") else [path / name]
+        strangers = sorted(f for f in there if f.is_file() and f.parent.resolve() / f.name not in own)
+        if strangers:
+            raise UserError(f"{strangers[0]}: freegeo did not write it, and it is in the way. Move or remove it.")
 
 
 def _unchanged(before: Mapping[str, Any], now: Mapping[str, Any], parts: Sequence[Part]) -> int:
@@ -212,7 +186,7 @@ def check_folder(
         raise UserError(f"{path}: is a file. Choose a folder for the output.")
     before = stored_state(path)
     if before is None:
-        if path.is_dir() and any(p.name not in OWN_FILES for p in path.iterdir()):
+        if path.is_dir() and any(p.name not in OWN_FILES and not _is_left_over(p) for p in path.iterdir()):
             raise UserError(f"{path}: holds files that freegeo did not write. Choose an empty or a new folder.")
         _require_writable(path)
         return
@@ -226,6 +200,11 @@ def check_folder(
             "Add --overwrite to replace it, or choose another folder."
         )
     _require_writable(path)
+
+
+def _is_left_over(path: Path) -> bool:
+    """Whether something was left half-written by a process that was killed, as the ledger of its folder says."""
+    return is_part(path) and path.name in ledger(path.parent)
 
 
 def stored_state(path: Path) -> dict[str, Any] | None:

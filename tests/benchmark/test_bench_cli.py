@@ -5,6 +5,7 @@ import pytest
 
 from bench_tools import DATASET, ROOMS
 from fixture_tools import fixture_path
+from freegeo.benchmark import predict as predicting
 from freegeo.benchmark.check import check_data, check_dataset
 from freegeo.cli.app import main
 from freegeo.data.datasets import eth3d
@@ -86,6 +87,22 @@ def test_a_run_prints_and_stores_its_tables_and_a_second_one_does_nothing_again(
         assert code == 2
         assert f"adaptation.{setting}: " in err
     assert freegeo("evaluate", "features", *options[:4])[0] in (0, 1)
+
+
+def test_a_run_whose_folder_is_deleted_ends_at_once(freegeo, options, tmp_path, monkeypatch):
+    plain, calls = predicting.write_stored, []
+
+    def deleting(*arguments):
+        calls.append(arguments)
+        shutil.rmtree(tmp_path / "out")
+        return plain(*arguments)
+
+    monkeypatch.setattr(predicting, "write_stored", deleting)
+    code, _, err = freegeo("run", "main", *options)
+    assert code == 1
+    assert "was removed or replaced while freegeo was writing there" in err.splitlines()[-1]
+    assert len(calls) == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_damaged_scene_is_named_and_the_others_are_scored(freegeo, options, tmp_path):

@@ -1,4 +1,5 @@
 import errno
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from freegeo.benchmark.tasks import (
     stored_tasks,
 )
 from freegeo.data.datasets.registry import load_scene
-from freegeo.errors import UserError
+from freegeo.errors import FreeGeoError, UserError
 from tiny_models import tiny_da3
 
 
@@ -252,3 +253,25 @@ def test_recipe_scene_is_the_same_for_every_dataset(setup):
 def test_recipe_evidence_is_refused_as_the_benchmark_makes_no_cameras_to_learn(setup):
     with pytest.raises(UserError, match="does not make the cameras that recipe 'evidence' learns from"):
         Predictor(replace(setup, recipe="evidence")).recipe(DATASET)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"dataset": "../../.."}, {"dataset": "/etc"}, {"variant": "../../../../.."}, {"scene": "other"}, {"views": 5},
+        {"scene": 3}, {"new": 1}, None,
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_task_belongs_to_the_folder_that_it_lies_in(tmp_path, change):
+    one = task()
+    finish(one, tmp_path, {})
+    path = one.folder(tmp_path) / TASK_FILE
+    outside = tmp_path.parent / f"{tmp_path.name}-outside"
+    outside.mkdir()
+    record = json.loads(path.read_text())
+    assert stored_tasks(tmp_path) == [(one, record)]
+    path.write_text(json.dumps([] if change is None else {**record, "task": {**record["task"], **change}}))
+    with pytest.raises(FreeGeoError, match=r"task\.json: .*predict again"):
+        evaluate_all(tmp_path / "data", tmp_path)
+    assert sorted(path.parent.iterdir()) == [path]

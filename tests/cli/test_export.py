@@ -11,9 +11,11 @@ from PIL import Image
 
 from cli.conftest import PHOTOS
 from cli.test_run import files
+from freegeo import files as writing
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import LEDGER_FILE, RUN_FILE
 from freegeo.fusion.settings import FilterSettings
+from freegeo.lock import locked
 from freegeo.models.da3 import DA3
 
 RESULT = {"report.html", "reconstruction.json", "prediction.npz", "kept.npz"}
@@ -284,3 +286,48 @@ def test_a_prediction_alone_has_no_photos(freegeo, out, tmp_path):
     assert "not at hand" in freegeo("export", tmp_path / "alone.npz", "-f", "nerfstudio", "-o", tmp_path / "new").err
     assert Reconstruction.load(tmp_path / "alone.npz").names == tuple(f"{k}.png" for k in range(PHOTOS))
     assert not (tmp_path / "new" / RUN_FILE).exists()
+
+
+# -- other processes, kills, and inputs that are outputs too
+
+
+def test_an_export_waits_for_nobody_and_disturbs_nobody(freegeo, out, tmp_path):
+    before = files(out)
+    for arguments in (("-o", tmp_path / "new"), ()):
+        with locked(out):
+            outcome = freegeo("export", out, "-f", "glb", *arguments)
+        assert outcome.code == 2
+        assert "another freegeo process is writing here" in outcome.sentence()
+    with locked(tmp_path / "new"):
+        outcome = freegeo("export", out, "-f", "glb", "-o", tmp_path / "new")
+        assert "another freegeo process is writing here" in outcome.sentence()
+    assert files(out) == before
+    assert not (tmp_path / "new").exists()
+    assert freegeo("export", out, "-f", "glb", "-o", tmp_path / "new").code == 0
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_what_a_killed_export_left_goes_with_the_next(freegeo, out, tmp_path, monkeypatch, inside):
+    target = out if inside else tmp_path / "new"
+
+    def killed(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        # A process that is killed removes nothing.
+        patch.setattr(writing, "_remove", lambda path: None)
+        patch.setattr(writing, "_flush", killed)
+        assert freegeo("export", out, "-f", "glb", "-o", target).code == 130
+    assert list(target.rglob("*.part*"))
+    assert freegeo("export", out, "-f", "ply", "-o", target).code == 0
+    assert not list(target.rglob("*.part*"))
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "run", "adapt"])
+def test_photos_are_not_overwritten_by_their_own_result(freegeo, out, photo_folder, tiny, command):
+    assert freegeo("export", out, "-f", "nerfstudio").code == 0
+    before = files(out)
+    outcome = freegeo(command, out / "images", "-o", out, *tiny, "--overwrite")
+    assert outcome.code == 2
+    assert "the command reads it, and --overwrite would remove it" in outcome.sentence()
+    assert files(out) == before

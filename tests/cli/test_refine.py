@@ -14,6 +14,7 @@ from freegeo.evidence.scores import epipolar
 from freegeo.export.photos import photo_records
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import write_json
+from freegeo.lock import locked
 
 VIEWS = 8
 
@@ -85,6 +86,22 @@ def test_photos_that_are_gone_are_missed(freegeo, result, tmp_path):
     outcome = freegeo("refine", tmp_path / "out", "-o", tmp_path / "refined")
     assert outcome.code == 2
     assert "its photos are not where they were" in outcome.sentence()
+    assert not (tmp_path / "refined").exists()
+
+
+def test_a_result_is_not_refined_into_itself_nor_while_it_is_written(freegeo, photo_folder, tiny, tmp_path):
+    pytest.importorskip("pycolmap", reason="needs the extra colmap")
+    out = tmp_path / "out"
+    assert freegeo("reconstruct", photo_folder, "-o", out, *tiny, "--formats", "npz").code == 0
+    before = sorted(path.name for path in out.iterdir())
+    outcome = freegeo("refine", out, "-o", out, "--overwrite")
+    assert outcome.code == 2
+    assert "holds the result that is to be refined" in outcome.sentence()
+    with locked(out):
+        outcome = freegeo("refine", out, "-o", tmp_path / "refined")
+    assert outcome.code == 2
+    assert "another freegeo process is writing here" in outcome.sentence()
+    assert sorted(path.name for path in out.iterdir()) == before
     assert not (tmp_path / "refined").exists()
 
 

@@ -16,11 +16,13 @@ import trimesh
 from safetensors.numpy import load_file
 
 from cli.conftest import PHOTOS, QUICK
+from freegeo import pipeline
 from freegeo.adaptation import adapt as adapting
 from freegeo.adaptation.adapter import is_adapted
 from freegeo.adaptation.state import UNFINISHED_FILE
 from freegeo.export import formats
-from freegeo.files import LEDGER_FILE, LOCK_FILE, RUN_FILE
+from freegeo.files import LEDGER_FILE, RUN_FILE
+from freegeo.lock import LOCK_FILE
 
 ADAPTER_FILES = {"adapter_config.json", "adapter_model.safetensors", "camera_token.safetensors", "freegeo.json"}
 RESULT_FILES = {"reconstruction.json", "prediction.npz", "kept.npz", "points.ply", "scene.glb"}
@@ -454,7 +456,7 @@ main({arguments!r})
 
 
 def test_two_processes_do_not_write_into_one_folder(freegeo, photo_folder, tiny, tmp_path):
-    from freegeo.run_folder import locked
+    from freegeo.lock import locked
 
     with locked(tmp_path):
         outcome = freegeo("run", photo_folder, "-o", tmp_path, *tiny, *QUICK)
@@ -492,3 +494,52 @@ def test_the_extra_of_recipe_evidence_is_asked_for_before_anything_is_written(
     assert outcome.code == 2
     assert "pip install 'freegeo[colmap]'" in outcome.sentence()
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("when", ["adaptation", "adapted prediction", "points and files", "report"])
+def test_a_run_whose_folder_is_deleted_ends_with_a_sentence_and_makes_nothing_anew(
+    freegeo, photo_folder, tiny, tmp_path, monkeypatch, when
+):
+    out = tmp_path / "out"
+    plain = pipeline.Hooks
+
+    def deleting(*, stage, step):
+        def told(name):
+            stage(name)
+            if name == when:
+                shutil.rmtree(out)
+
+        return plain(stage=told, step=step)
+
+    monkeypatch.setattr(pipeline, "Hooks", deleting)
+    outcome = freegeo("run", photo_folder, "-o", out, *tiny, *QUICK)
+    assert outcome.code == 1
+    assert "was removed or replaced while freegeo was writing there" in outcome.sentence()
+    assert not out.exists()
+
+
+def test_a_run_that_lost_its_frozen_prediction_is_not_finished(freegeo, photo_folder, tiny, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    plain = pipeline.write_report
+
+    def report(folder, **options):
+        shutil.rmtree(out / "frozen")
+        return plain(folder, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "write_report", report)
+        outcome = freegeo("run", photo_folder, "-o", out, *tiny, *QUICK)
+        assert outcome.code == 1
+        assert "run the command again" in outcome.sentence()
+    outcome = freegeo("run", photo_folder, "-o", out, *tiny, *QUICK)
+    assert outcome.code == 0, outcome.err
+    assert (out / "frozen" / "prediction.npz").is_file()
+
+
+def test_an_adapter_is_not_overwritten_by_the_result_that_it_is_for(freegeo, finished, photo_folder, tiny, tmp_path):
+    out = Path(shutil.copytree(finished, tmp_path / "out"))
+    before = files(out)
+    outcome = freegeo("reconstruct", photo_folder, "--adapter", out, "-o", out, *tiny, "--overwrite")
+    assert outcome.code == 2
+    assert "the command reads it, and --overwrite would remove it" in outcome.sentence()
+    assert files(out) == before

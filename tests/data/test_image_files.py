@@ -1,6 +1,9 @@
 """Image files of every kind: told by content, upright whatever else their EXIF data say, with the right brightness."""
 
+import io
+import shutil
 import struct
+import subprocess
 
 import cv2
 import numpy as np
@@ -8,8 +11,11 @@ import pytest
 from PIL import Image
 
 from data.test_photos import ORIENTATION, STORED, names, quarters, refusal, save
-from freegeo.data.image_files import FORMATS, is_blank
+from freegeo.data.datasets.base import read_gray
+from freegeo.data.image_files import FORMATS, UnreadableImageError, is_blank
+from freegeo.data.masks import load_masks
 from freegeo.data.photos import load_photos, open_photos
+from freegeo.errors import UserError
 
 
 def read(path) -> np.ndarray:
@@ -224,3 +230,44 @@ def test_dark_and_bright_pictures_with_content_are_not_blank():
     assert not is_blank(255 - night)
     noise = rng.normal(128, 5, (240, 400)).clip(0, 255).astype(np.uint8)
     assert is_blank(noise), "a lens cap in noise"
+
+
+# -- other formats of Pillow, of which some start programs
+
+
+def others() -> dict[str, bytes]:
+    """A file in every format that Pillow can write and that is not read."""
+    Image.init()
+    found = {}
+    for kind in sorted(set(Image.SAVE) - {*FORMATS, "MPO", "HEIF"}):
+        for mode in ("RGB", "L", "1", "P", "F"):
+            buffer = io.BytesIO()
+            try:
+                Image.new(mode, (64, 64)).save(buffer, kind)
+            except (OSError, ValueError, KeyError):
+                continue
+            found[kind] = buffer.getvalue()
+            break
+    return found
+
+
+@pytest.mark.filterwarnings("ignore:IM image format is deprecated")
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".gif", ""])
+def test_other_formats_are_refused_whatever_they_are_called(tmp_path, monkeypatch, suffix):
+    def start(*arguments, **options):
+        pytest.fail("a program was started")
+
+    monkeypatch.setattr(subprocess.Popen, "__init__", start)
+    kinds = others()
+    assert {"EPS", "SPIDER", "TGA", "PCX", "ICO", "DDS"} <= kinds.keys()
+    for content in kinds.values():
+        (tmp_path / "photos").mkdir()
+        file = tmp_path / "photos" / f"a{suffix}"
+        file.write_bytes(content)
+        with pytest.raises(UserError, match=r"not a photo|not a readable image|no photos found"):
+            load_photos(file)
+        with pytest.raises(UnreadableImageError):
+            read_gray(file)
+        with pytest.raises(UserError, match="have no mask"):
+            load_masks(file.parent, ["a.jpg"], [(64, 64)])
+        shutil.rmtree(file.parent)

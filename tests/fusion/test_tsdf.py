@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from freegeo.errors import UserError
+from freegeo.export.mesh import load_mesh
 from freegeo.fusion.marching import extract_surface
 from freegeo.fusion.mesh import Mesh, empty_mesh_substitute, read_mesh, sample_surface
 from freegeo.fusion.tsdf import TsdfVolume
@@ -131,3 +133,29 @@ def test_a_mesh_without_surface_cannot_be_sampled():
     assert np.abs(empty_mesh_substitute(100)).max() <= 1
     with pytest.raises(UserError):
         read_mesh("no/such.ply")
+
+
+MATERIALS = {
+    "m.ply": "ply\nformat ascii 1.0\ncomment TextureFile picture.eps\nelement vertex 3\nproperty float x\n"
+    "property float y\nproperty float z\nproperty float s\nproperty float t\nelement face 1\n"
+    "property list uchar int vertex_indices\nend_header\n0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n",
+    "m.obj": "mtllib m.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n",
+}
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_a_mesh_opens_no_picture_that_it_names(tmp_path, monkeypatch, name, capfd):
+    Image.new("RGB", (8, 8)).save(tmp_path / "picture.eps")
+    (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd picture.eps\n")
+    (tmp_path / name).write_text(MATERIALS[name])
+    monkeypatch.setattr(Image, "open", lambda *arguments, **options: pytest.fail("a picture was opened"))
+    for read in (read_mesh, load_mesh):
+        assert len(read(tmp_path / name).vertices) == 3
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("name", ["scene.glb", "scene.gltf", "scene.zip", "scene", "scene.xyz"])
+def test_other_kinds_of_meshes_are_refused(tmp_path, name):
+    (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(UserError, match="a mesh is read from ply, obj, stl, off"):
+        read_mesh(tmp_path / name)

@@ -72,7 +72,7 @@ def test_distances_are_those_of_the_wrong_cameras(scene, matches, tmp_path):
 def test_nothing_is_drawn_without_matches_lines_or_for_other_photos(scene, matches, tmp_path):
     assert pair_pictures(tmp_path, scene, None) == []
     matches.save(tmp_path / "matches.npz")
-    assert pair_pictures(tmp_path, replace(scene, names=("other",) * VIEWS), None) == []
+    assert pair_pictures(tmp_path, replace(scene, names=tuple(f"other {k}" for k in range(VIEWS))), None) == []
     together = replace(scene, T_cam_world=np.tile(np.eye(4, dtype=np.float32), (VIEWS, 1, 1)))
     assert pair_pictures(tmp_path, together, None) == []
 

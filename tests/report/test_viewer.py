@@ -9,12 +9,13 @@ import torch
 
 from exact_rooms import room
 from example_results import write_example
-from freegeo.errors import UserError
+from freegeo.errors import FreeGeoError, UserError
 from freegeo.geometry.rotation import quat_wxyz_to_xyzw, quat_xyzw_to_matrix
 
 pytest.importorskip("viser")
 from freegeo.cli import view as command
 from freegeo.report import viewer
+from freegeo.report.origin import is_own_page, own_pages_only
 
 
 @pytest.fixture(scope="module")
@@ -179,3 +180,56 @@ def test_the_command_says_where_to_look_and_warns(monkeypatch, capsys, tmp_path,
     assert handle.closed
     with pytest.raises(UserError, match="name one output folder"):
         command.view()
+
+
+# -- other web pages
+
+
+def handshake(port: int, origins: list[str], host: str, upgrade: str = "websocket") -> int:
+    """Open a websocket as a browser does, and return the status of the answer."""
+    import viser
+
+    lines = [
+        "GET / HTTP/1.1", f"Host: {host}", f"Upgrade: {upgrade}", "Connection: Upgrade", "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", f"Sec-WebSocket-Protocol: viser-v{viser.__version__}",
+        *(f"Origin: {origin}" for origin in origins),
+    ]  # fmt: skip
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+        connection.sendall("\r\n".join([*lines, "", ""]).encode())
+        with connection.makefile("rb") as answer:
+            return int(answer.readline().split()[1])
+
+
+def test_a_foreign_page_gets_no_scene(example, caplog):
+    port = free_port()
+    shown = viewer.open_viewer([example], port=port)
+    try:
+        own = f"localhost:{port}"
+        for host in (own, f"127.0.0.1:{port}", f"[::1]:{port}", "localhost:9000"):  # the last one through a tunnel
+            assert handshake(port, [f"http://{host}"], host) == 101, host
+        assert not caplog.text
+        foreign = (
+            ["https://evil.example"], ["null"], ["file://"], [], ["http://localhost:3000"], [f"http://{own}.evil.example"],
+            [f"http://{own}@evil.example"], [f"ftp://{own}"], ["https://evil.example", f"http://{own}"], ["http://["],
+        )  # fmt: skip
+        for origins in foreign:
+            assert handshake(port, origins, own) == 403, origins
+        assert handshake(port, ["https://evil.example"], own, upgrade="WebSocket") == 403
+        # A name of somebody else that is made to lead here is the same for the browser, but not for us.
+        assert handshake(port, [f"http://evil.example:{port}"], f"evil.example:{port}") == 403
+        assert "refused a request of the page 'https://evil.example'" in caplog.text
+        assert caplog.text.count("'https://evil.example'.") == 1
+    finally:
+        shown.close()
+
+
+def test_pages_of_a_viewer_for_other_machines():
+    for name in ("192.168.1.7:8080", "gpu.lab:8080", socket.gethostname(), "[fe80::1]:8080"):
+        assert is_own_page([f"http://{name}"], [name.upper()], "gpu.lab"), name
+    assert not is_own_page(["http://gpu.lab:8080"], ["gpu.lab:8080"], "0.0.0.0")
+    assert not is_own_page(["http://10.0.0.1:8080"], ["192.168.1.7:8080"], "0.0.0.0")
+
+
+def test_a_viewer_that_cannot_be_guarded_is_refused():
+    with pytest.raises(FreeGeoError, match="cannot be guarded"), own_pages_only("localhost"):
+        pass

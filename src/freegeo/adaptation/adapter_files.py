@@ -56,7 +56,6 @@ def save_adapter(adapter: Adapter, folder: Path, metadata: Mapping[str, Any]) ->
 
     Returns the files. The tensors are those of strength 1.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     files = write_peft(adapter, folder)
     if adapter.camera_token is not None:
         write_tensors(folder / TOKEN, {"camera_token": adapter.camera_token.float()})

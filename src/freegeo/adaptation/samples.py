@@ -36,6 +36,7 @@ from freegeo.adaptation.losses import (
 from freegeo.adaptation.recipe import LossConfig, Recipe
 from freegeo.adaptation.views import ViewSet, Visit
 from freegeo.errors import UserError
+from freegeo.files import scratch_folder
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.precision import Compute
 from freegeo.types import Features, ImageBatch, PhotoLike, Priors, ViewTokens
@@ -222,7 +223,7 @@ class Samples:
         view_sets = [visit.view_set for visits in steps for visit in visits]
         self._left = Counter(sample_key(view_set, recipe) for view_set in view_sets)
         self._kept: dict[SampleKey, Sample] = {}
-        self._folder = _empty_folder(folder) if place == "disk" else None
+        self._folder = _own_folder(folder) if place == "disk" else None
         self._files = 0
         self._tokens = self._embedded(scenes, distinct(view_sets, recipe))
 
@@ -378,14 +379,6 @@ def loaded_ahead(scenes: Sequence[SceneImages], requests: Iterable[tuple[int, Se
         thread.shutdown(cancel_futures=True)
 
 
-def _empty_folder(parent: Path | None) -> Path:
-    """Return an empty folder for the files of a run; files that a killed run left in it are removed."""
-    if parent is None:
-        return Path(tempfile.mkdtemp(prefix="freegeo-samples-"))
-    folder = parent / "freegeo-samples"
-    try:
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be written to ({error.strerror}). Choose another output folder.") from None
-    return folder
+def _own_folder(parent: Path | None) -> Path:
+    """Return an empty folder for the files of a run."""
+    return Path(tempfile.mkdtemp(prefix="freegeo-samples-")) if parent is None else scratch_folder(parent, "samples")

@@ -14,7 +14,7 @@ import torch
 
 from freegeo.adaptation.adapter import Adapter
 from freegeo.errors import UserError
-from freegeo.files import write_tensors
+from freegeo.files import remove_file, write_tensors
 
 UNFINISHED_FILE = "adapting.safetensors"
 _EARLIER = "earlier|"
@@ -78,7 +78,7 @@ def read_state(
 
 def remove_state(folder: Path) -> None:
     """Remove the state of a run that is finished."""
-    (folder / UNFINISHED_FILE).unlink(missing_ok=True)
+    remove_file(folder / UNFINISHED_FILE)
 
 
 @contextmanager

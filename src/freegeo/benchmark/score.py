@@ -41,7 +41,7 @@ from freegeo.benchmark.tasks import (
 from freegeo.data.datasets.registry import load_scene, true_depth
 from freegeo.data.scene import Scene
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import read_json, write_json
+from freegeo.files import read_json, remove_file, write_json
 from freegeo.metrics.cloud import f1_rel5
 from freegeo.metrics.depth import score_depth
 from freegeo.metrics.scene import at_size
@@ -149,7 +149,7 @@ def _scored(
     path = task.folder(out) / SCORES_FILE
     if path.is_file() and not read_json(path)["failed"]:
         return []
-    path.unlink(missing_ok=True)
+    remove_file(path)
     if variant(task.variant).measures == "features":
         write_json(path, {"metrics": read_json(task.folder(out) / MEASURED_FILE), "failed": {}})
         return []

@@ -23,8 +23,8 @@ from typing import Any, Literal, TypeVar, get_args
 import torch
 
 from freegeo.benchmark import sampling
-from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import as_json, read_json, write_json
+from freegeo.errors import FreeGeoError, LostFolderError, UserError
+from freegeo.files import as_json, read_json, remove_file, write_json
 from freegeo.models.spec import AdaptationDefaults
 from freegeo.run_folder import difference
 
@@ -136,14 +136,30 @@ def is_finished(task: Task, out: Path, configuration: Mapping[str, Any], *, over
 def finish(task: Task, out: Path, configuration: Mapping[str, Any], **facts: Any) -> None:
     """Mark a task as done; older scores of it are dropped."""
     folder = task.folder(out)
-    (folder / SCORES_FILE).unlink(missing_ok=True)
+    remove_file(folder / SCORES_FILE)
     write_json(folder / TASK_FILE, {"task": asdict(task), "configuration": as_json(configuration), **facts})
 
 
 def stored_tasks(out: Path) -> list[tuple[Task, dict[str, Any]]]:
-    """All finished tasks of a folder with the content of task.json, in the order of their folders."""
-    records = [read_json(path) for path in sorted((Path(out) / PREDICTIONS).glob(f"*/*/*/*/{TASK_FILE}"))]
-    return [(Task(**record["task"]), record) for record in records]
+    """All finished tasks of a folder with the content of task.json, in the order of their folders.
+
+    FreeGeoError for a file that describes no task, or that of another folder.
+    """
+    found = []
+    for path in sorted((Path(out) / PREDICTIONS).glob(f"*/*/*/*/{TASK_FILE}")):
+        record = read_json(path)
+        try:
+            task = Task(**record["task"])
+            # Files are written and removed where the task says.
+            fits = task.folder(out) == path.parent
+        except (TypeError, KeyError, AttributeError):
+            fits = False
+        if not fits:
+            raise FreeGeoError(
+                f"{path}: does not describe the task of its folder. Remove that folder and predict again."
+            )
+        found.append((task, record))
+    return found
 
 
 def run_each(
@@ -152,11 +168,16 @@ def run_each(
     explain: Callable[[Item, BaseException], Problem],
     on_done: Callable[[Item], None] = lambda item: None,
 ) -> list[Problem]:
-    """Do the work for every item; an item that fails on its data becomes a problem and the others go on."""
+    """Do the work for every item; an item that fails on its data becomes a problem and the others go on.
+
+    LostFolderError: the output folder is gone, so that all others would fail too.
+    """
     problems: list[Problem] = []
     for item in items:
         try:
             problems += work(item) or ()
+        except LostFolderError:
+            raise
         except DAMAGED as error:
             logger.debug("failed on %s", item, exc_info=True)
             problems.append(explain(item, error))

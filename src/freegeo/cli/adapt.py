@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
-from freegeo.cli.jobs import LABELS, check_place, say_finished
+from freegeo.cli.jobs import LABELS, check_inputs, check_place, say_finished
 from freegeo.cli.options import CameraOptions, ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source, split_scenes
 from freegeo.progress import step_bar
@@ -66,6 +66,7 @@ def adapt(
     empty.adaptable()
     plan = recipe.build(empty.spec)
     scenes = {str(part[0]): load_source(part, photos) for part in split_scenes(sources)}
+    check_inputs(output, [photo for found in scenes.values() for photo in found], cameras.cameras)
     model.warn_of_embedded(sources)
     for found in scenes.values():
         require_enough_photos(found)

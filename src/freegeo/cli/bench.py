@@ -281,7 +281,7 @@ def _predict(
 ) -> list[Problem]:
     from freegeo.benchmark.cost import estimate, estimate_scoring
     from freegeo.benchmark.predict import predict_all
-    from freegeo.run_folder import locked
+    from freegeo.lock import locked
 
     waiting = predictor.unfinished(tasks)
     console.say(f"{len(tasks)} tasks, {len(tasks) - len(waiting)} of them finished")
@@ -393,10 +393,10 @@ def _require_none(problems: Sequence[Problem], out: Path) -> None:
     """Store what failed and end with exit code 1 when anything did."""
     from dataclasses import asdict
 
-    from freegeo.files import write_json
+    from freegeo.files import remove_file, write_json
 
     if not problems:
-        (out / PROBLEMS_FILE).unlink(missing_ok=True)
+        remove_file(out / PROBLEMS_FILE)
         return
     write_json(out / PROBLEMS_FILE, [asdict(problem) for problem in problems])
     scenes = {(problem.dataset, problem.scene) for problem in problems}

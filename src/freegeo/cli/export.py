@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
 from freegeo.cli import console
 from freegeo.cli.files import FORMAT_NAMES, FilterOptions, require_complete
-from freegeo.errors import UserError
+from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.base import MAX_TRACKS
 from freegeo.fusion.settings import MAX_POINTS
 
@@ -54,36 +55,40 @@ def export(
     from freegeo.export.measured import load_tracks
     from freegeo.export.pixels import masks_for_model
     from freegeo.export.reconstruction import Reconstruction
+    from freegeo.files import remove_parts
+    from freegeo.lock import kept_still, locked
     from freegeo.pipeline import FROZEN_FOLDER
-    from freegeo.run_folder import locked
 
     source = source.expanduser()
     stored = source / FROZEN_FOLDER if frozen else source
-    reconstruction = Reconstruction.load(stored)
     home = stored.parent if stored.is_file() else stored
     target = home if output is None else output.expanduser()
     run = result_folder(home)
     if result_folder(target) not in (None, run):
         raise UserError(f"{target}: holds another result. Choose another folder for the files (--output).")
-    names = formats.check_formats(format, reconstruction.names, has_cameras=reconstruction.has_cameras)
-    filtered, masks = None, None
-    if filters is None:
-        filtered = load_kept(home, reconstruction.depth_z.shape)
-        masks = None if filtered is None else load_masks(home)
-    else:
-        sizes = [(height, width) for height, width in reconstruction.photo_hw.tolist()]
-        given = filters.load_masks(reconstruction.names, sizes, model_hw=reconstruction.image_hw)
-        masks = None if given is None else masks_for_model(reconstruction, given)
-        if reconstruction.has_cameras:
-            filtered = formats.filter_reconstruction(reconstruction, masks=masks, settings=filters.settings())
-            if target.resolve() == run:
-                require_points_of_report(target, filtered[0])
-    with locked(result_folder(target) or target):
-        result = formats.export(
-            reconstruction, target, names, filtered=filtered, masks=masks,
-            photos=find_photos(reconstruction, run or home), max_points=max_points, max_tracks=max_tracks, voxel=voxel,
-            tracks=load_tracks(home),
-        ).require_any()  # fmt: skip
+    with kept_still(run):
+        reconstruction = Reconstruction.load(stored)
+        names = formats.check_formats(format, reconstruction.names, has_cameras=reconstruction.has_cameras)
+        filtered, masks = None, None
+        if filters is None:
+            filtered = load_kept(home, reconstruction.depth_z.shape)
+            masks = None if filtered is None else load_masks(home)
+        else:
+            sizes = [(height, width) for height, width in reconstruction.photo_hw.tolist()]
+            given = filters.load_masks(reconstruction.names, sizes, model_hw=reconstruction.image_hw)
+            masks = None if given is None else masks_for_model(reconstruction, given)
+            if reconstruction.has_cameras:
+                filtered = formats.filter_reconstruction(reconstruction, masks=masks, settings=filters.settings())
+                if target.resolve() == run:
+                    require_points_of_report(target, filtered[0])
+        place = result_folder(target) or target
+        with nullcontext() if place == run else locked(place):
+            remove_parts(place)
+            result = formats.export(
+                reconstruction, target, names, filtered=filtered, masks=masks,
+                photos=find_photos(reconstruction, run or home), max_points=max_points, max_tracks=max_tracks,
+                voxel=voxel, tracks=load_tracks(home, len(reconstruction)),
+            ).require_any()  # fmt: skip
     for file in result.files:
         console.say(f"  {file}  {console.size(file)}")
     require_complete(target, result.failed)
@@ -110,16 +115,40 @@ def result_folder(folder: Path) -> Path | None:
     return next((parent for parent in (folder, *folder.parents) if (parent / RUN_FILE).is_file()), None)
 
 
+def stored_summary(folder: Path) -> dict[str, Any]:
+    """Return what later commands read of reconstruction.json in a folder; FreeGeoError when it is damaged.
+
+    `images` and `photo_files` are lists (of names; of records with texts `file` and `sha256`, or None), `refinement` is
+    an object, `warnings` a list; each is empty where the file, or the field, is missing.
+    """
+    from freegeo.files import read_json
+    from freegeo.pipeline import SUMMARY_NAME
+
+    file = folder / SUMMARY_NAME
+    content = read_json(file) if file.is_file() else {}
+    if isinstance(content, dict):
+        fields = {"images": list, "photo_files": list, "refinement": dict, "warnings": list}
+        summary = content | {name: content.get(name) or kind() for name, kind in fields.items()}
+        records = summary["photo_files"] if isinstance(summary["photo_files"], list) else [()]
+        if all(isinstance(summary[name], kind) for name, kind in fields.items()) and all(map(_is_record, records)):
+            return summary
+    raise FreeGeoError(f"{file}: damaged file. Remove it, or run again.")
+
+
+def _is_record(value: Any) -> bool:
+    texts = [value.get(name) for name in ("file", "sha256")] if isinstance(value, dict) else []
+    return value is None or (len(texts) == 2 and all(isinstance(text, str) and "\0" not in text for text in texts))
+
+
 def find_photos(reconstruction: Reconstruction, run: Path) -> list[Photo] | None:
     """Return the photos of a stored result if all are as they were, or as upright copies in its folder; else None."""
     from freegeo.data.photos import Photo
     from freegeo.export import colmap
     from freegeo.export.photos import FOLDER, content_hash, copy_names
-    from freegeo.files import ledger, read_json
-    from freegeo.pipeline import SUMMARY_NAME
+    from freegeo.files import ledger
 
-    summary = read_json(run / SUMMARY_NAME) if (run / SUMMARY_NAME).is_file() else {}
-    records = dict(zip(summary.get("images", ()), summary.get("photo_files", ()), strict=False))
+    summary = stored_summary(run)
+    records = dict(zip(map(str, summary["images"]), summary["photo_files"], strict=False))
     own = set(ledger(run))
     photos = []
     for name, copy, (height, width) in zip(

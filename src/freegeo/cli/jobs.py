@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -28,7 +28,7 @@ from freegeo.export.base import KEPT_NAME, TRACKS_NAME
 from freegeo.export.formats import FORMATS
 from freegeo.export.photos import FOLDER as COPIES_FOLDER
 from freegeo.export.photos import write_copies
-from freegeo.files import read_json
+from freegeo.files import ledger, read_json
 from freegeo.models.spec import MIXED, Mixed, PoseFrom
 from freegeo.progress import step_bar
 from freegeo.run_folder import check_folder, run_folder, stored_state
@@ -132,6 +132,7 @@ def run_job(
     from freegeo.posed import check_known, is_one_camera, require_cameras, told, undistorted_masks
 
     check_place(output)
+    check_inputs(output, photos, adapter, cameras.cameras)
     empty = model_options.build_empty()
     formats = files.all_formats(output, photos, has_cameras=empty.spec.cameras)
     require_pose_from(empty.spec, pose_from)
@@ -224,6 +225,21 @@ def check_place(output: OutputOptions) -> None:
     """Refuse a folder that cannot be used whatever the settings are, before anything is loaded or downloaded."""
     if stored_state(output.output) is None:
         check_folder(output.output, {}, overwrite=output.overwrite)
+
+
+def check_inputs(output: OutputOptions, photos: Iterable[PhotoLike], *others: Path | None) -> None:
+    """Refuse to remove with --overwrite the photos, or other files and folders, that the command reads."""
+    if not output.overwrite:
+        return
+    out = output.output.resolve()
+    own = {(out / name).resolve() for name in ledger(out)}
+    own |= {folder for file in own for folder in file.parents if folder.is_relative_to(out)}
+    inputs = [*(getattr(photo, "path", None) for photo in photos), *others]
+    taken = next((path for path in inputs if isinstance(path, Path) and path.resolve() in own), None)
+    if taken is not None:
+        raise UserError(
+            f"{taken}: the command reads it, and --overwrite would remove it. Choose another output folder."
+        )
 
 
 def adapter_identity(folder: Path) -> dict[str, str]:

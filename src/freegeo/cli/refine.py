@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from freegeo.cli import console
-from freegeo.cli.export import find_photos
+from freegeo.cli.export import find_photos, result_folder, stored_summary
 from freegeo.cli.files import FORMAT_NAMES, require_complete
 from freegeo.cli.jobs import FILES, say_answer, say_finished
 from freegeo.cli.options import OutputOptions
@@ -35,7 +35,8 @@ def refine(
     from freegeo.export.kept import load_kept, load_masks
     from freegeo.export.measured import save_tracks
     from freegeo.export.reconstruction import Reconstruction
-    from freegeo.files import read_json, write_json
+    from freegeo.files import write_json
+    from freegeo.lock import kept_still
     from freegeo.models.checkpoints import fingerprint
     from freegeo.pipeline import MATCHES_NAME, PREDICTION_NAME, SUMMARY_NAME, UNREFINED_FOLDER, write_files
     from freegeo.refined import refine_by_photos
@@ -43,43 +44,47 @@ def refine(
     from freegeo.run_folder import run_folder
 
     pycolmap_module()
-    before = Reconstruction.load(source)
-    names = check_formats(formats, before.names, has_cameras=before.has_cameras)
-    summary = read_json(source / SUMMARY_NAME) if (source / SUMMARY_NAME).is_file() else {}
-    if (summary.get("refinement") or {}).get("accepted"):
-        raise UserError(f"{source}: is refined already.")
-    if summary.get("known_cameras"):
-        raise UserError(f"{source}: its cameras are known ones, which are not to be moved.")
-    photos = find_photos(before, source)
-    if photos is None:
-        raise UserError(f"{source}: its photos are not where they were, or have changed; matches need them.")
-    settings = {
-        "command": "refine", "source": str(source.resolve()), "prediction": fingerprint(source / PREDICTION_NAME),
-        "formats": names,
-    }  # fmt: skip
-    with run_folder(output.output, settings, overwrite=output.overwrite) as folder:
-        if folder.finished:
-            say_finished(output.output, folder.finished_at)
-            return
-        console.note("matches between the photos, and bundle adjustment ...")
-        found = refine_by_photos(before, photos, store=folder / MATCHES_NAME)
-        if found.tracks is None:
-            raise FreeGeoError(f"{source}: not refined, nothing is written. {found.about['reason']}")
-        before.save(folder / UNREFINED_FOLDER)
-        save_tracks(folder.path, found.tracks)
-        found.result.save(folder.path)
-        masks = None if load_kept(source, before.depth_z.shape) is None else load_masks(source)
-        filters, failed = write_files(folder.path, found.result, names, masks=masks, photos=photos)
-        told = {
-            "frozen_prediction": None, "refinement": found.about, "not_written": dict(failed),
-            "filters": None if filters is None else {"pixels": filters.pixels, "removed": dict(filters.removed)},
-            "command": console.command_line(), "verdict": None, "loss": None, "rejected_adapter": None,
-            "warnings": list(dict.fromkeys([*summary.get("warnings", []), *console.warned()])),
+    run = result_folder(source)
+    if run == output.output.resolve():
+        raise UserError(f"{output.output}: holds the result that is to be refined. Choose another folder (--output).")
+    with kept_still(run):
+        before = Reconstruction.load(source)
+        names = check_formats(formats, before.names, has_cameras=before.has_cameras)
+        summary = stored_summary(source)
+        if summary["refinement"].get("accepted"):
+            raise UserError(f"{source}: is refined already.")
+        if summary.get("known_cameras"):
+            raise UserError(f"{source}: its cameras are known ones, which are not to be moved.")
+        photos = find_photos(before, source)
+        if photos is None:
+            raise UserError(f"{source}: its photos are not where they were, or have changed; matches need them.")
+        settings = {
+            "command": "refine", "source": str(source.resolve()), "prediction": fingerprint(source / PREDICTION_NAME),
+            "formats": names,
         }  # fmt: skip
-        summary = {**summary, **told}
-        write_json(folder / SUMMARY_NAME, summary)
-        write_report(folder.path, photos=photos)
-        folder.finish()
+        with run_folder(output.output, settings, overwrite=output.overwrite) as folder:
+            if folder.finished:
+                say_finished(output.output, folder.finished_at)
+                return
+            console.note("matches between the photos, and bundle adjustment ...")
+            found = refine_by_photos(before, photos, store=folder / MATCHES_NAME)
+            if found.tracks is None:
+                raise FreeGeoError(f"{source}: not refined, nothing is written. {found.about['reason']}")
+            before.save(folder / UNREFINED_FOLDER)
+            save_tracks(folder.path, found.tracks)
+            found.result.save(folder.path)
+            masks = None if load_kept(source, before.depth_z.shape) is None else load_masks(source)
+            filters, failed = write_files(folder.path, found.result, names, masks=masks, photos=photos)
+            told = {
+                "frozen_prediction": None, "refinement": found.about, "not_written": dict(failed),
+                "filters": None if filters is None else {"pixels": filters.pixels, "removed": dict(filters.removed)},
+                "command": console.command_line(), "verdict": None, "loss": None, "rejected_adapter": None,
+                "warnings": list(dict.fromkeys([*summary["warnings"], *console.warned()])),
+            }  # fmt: skip
+            summary = {**summary, **told}
+            write_json(folder / SUMMARY_NAME, summary)
+            write_report(folder.path, photos=photos)
+            folder.finish()
     say_answer(summary)
     console.written(output.output, FILES)
     require_complete(output.output, failed)

@@ -207,6 +207,12 @@ def rgba_pixels(image: PillowImage, path: Path) -> np.ndarray:
     return _turned(np.asarray(image.convert("RGBA")), orientation(image))
 
 
+def stored_values(image: PillowImage, path: Path) -> np.ndarray:
+    """Decode an opened image to its values as they are stored, (H, W) or (H, W, C), not turned."""
+    _load(image, path)
+    return np.array(image)
+
+
 def deep_values(image: PillowImage, path: Path | str) -> np.ndarray | None:
     """Return the upright values of an image of more than 8 bits a channel, None of any other.
 

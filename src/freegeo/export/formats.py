@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from freegeo import files
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import FreeGeoError, LostFolderError, UserError
 from freegeo.export import colmap, depth_png, glb, mesh, nerfstudio, ply
 from freegeo.export import reconstruction as npz
 from freegeo.export.base import MAX_TRACKS, Export, Exported, Format
@@ -156,7 +156,7 @@ def export(
             if format.needs_cameras and not reconstruction.has_cameras:
                 raise FreeGeoError(NO_CAMERAS)
             done = run.write(format)
-        except UserError:
+        except (UserError, LostFolderError):
             raise
         except FreeGeoError as error:
             failed[format.name] = str(error)

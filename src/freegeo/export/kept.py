@@ -53,9 +53,10 @@ def load_kept(folder: Path, shape: tuple[int, ...]) -> Filtered | None:
             keep = content["keep"]
             removed = dict(zip(content["removed_by"].tolist(), content["removed"].tolist(), strict=True))
             tolerance = float(content["tolerance"])
+            masks = content["masks"] if "masks" in content.files else keep
     except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, TypeError, EOFError, OSError) as error:
         raise FreeGeoError(f"{file}: damaged file ({error}). Remove it and run again.") from None
-    if keep.shape != shape or keep.dtype != bool:
+    if any(one.shape != shape or one.dtype != bool for one in (keep, masks)):
         raise FreeGeoError(f"{file}: belongs to another reconstruction. Remove it and run again.")
     tolerances = None if math.isnan(tolerance) else tolerance
     return keep, FilterReport(pixels=keep.size, removed=removed, tolerance=tolerances)

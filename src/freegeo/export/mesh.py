@@ -15,6 +15,8 @@ from freegeo.export.ply import ply_bytes
 from freegeo.export.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
+    from trimesh import Trimesh
+
     from freegeo.fusion.mesh import Mesh
 
 logger = logging.getLogger(__name__)
@@ -79,6 +81,19 @@ def vertex_colours(mesh: Mesh, reconstruction: Reconstruction, keep: np.ndarray,
         count[rows[seen]] += 1
     mean = total / np.maximum(count, 1)[:, None]
     return np.where(count[:, None] > 0, mean.round(), _GREY).astype(np.uint8)
+
+
+def load_mesh(path: Path) -> Trimesh:
+    """Read what `write_mesh` wrote, with its colours; FreeGeoError when the file is damaged."""
+    from freegeo.fusion.mesh import load_geometry
+
+    try:
+        found = load_geometry(path, force="mesh")
+    except (ValueError, LookupError, OSError, TypeError) as error:
+        raise FreeGeoError(f"{path}: damaged mesh ({error}). Export it again.") from None
+    if not hasattr(found, "faces"):
+        raise FreeGeoError(f"{path}: holds no triangles. Export it again.")
+    return found
 
 
 def write_mesh(reconstruction: Reconstruction, keep: np.ndarray, path: Path, *, voxel: float | None = None) -> Path:

@@ -7,7 +7,6 @@ HEIC nor 16-bit values as freegeo does. What they can read as it is, is copied b
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import shutil
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from freegeo import files
+from freegeo.data.image_files import opened
 from freegeo.errors import FreeGeoError, UserError
 
 if TYPE_CHECKING:
@@ -42,8 +42,9 @@ def _copy_suffix(suffix: str) -> str:
 def new_names(names: Sequence[str], suffixes: Sequence[str]) -> list[str]:
     """Return file names with other suffixes, all different and none too long for a file.
 
-    Where photos differ in the suffix only, the new suffix is added to the old one.
+    Where photos differ in the suffix only, the new suffix is added to the old one. Errors as `check_names`.
     """
+    check_names(names)
     pairs = list(zip(names, suffixes, strict=True))
     short = [str(PurePosixPath(name).with_suffix(suffix)) for name, suffix in pairs]
     added = [name if name.endswith(suffix) else name + suffix for name, suffix in pairs]
@@ -79,18 +80,16 @@ def write_copies(photos: Sequence[PhotoLike], folder: Path) -> list[Path]:
 
 def _readable_as_stored(photo: PhotoLike, suffix: str) -> bytes | None:
     """Return the content of a photo's file if every reader takes its pixels as `photo.read` does."""
-    from PIL import Image
-
     path = own_file(photo)
     if path is None or path.suffix.lower() != suffix:
         return None
     try:
         content = path.read_bytes()
-        with Image.open(io.BytesIO(content)) as image:
+        with opened(path) as image:
             upright = image.getexif().get(_ORIENTATION_TAG, 1) == 1
             plain = image.mode in ("RGB", "L") and "transparency" not in image.info
             as_named = image.format in _KINDS[suffix] and image.size == photo.size_hw[::-1]
-    except (OSError, SyntaxError, ValueError, TypeError, KeyError):
+    except (OSError, SyntaxError, ValueError, TypeError, KeyError):  # among them that it is no image any more
         # Pillow raises different errors for odd metadata; decoding and encoding anew leaves it behind.
         return None
     return content if upright and plain and as_named else None

@@ -108,7 +108,7 @@ class Reconstruction:
     """What the lengths being metres rests on; None: they are up to scale."""
 
     def __post_init__(self) -> None:
-        """Raise FreeGeoError when a shape does not fit the others."""
+        """Raise FreeGeoError when a shape does not fit the others, or two views have one name."""
         views, height, width = self.depth_z.shape
         expected = {
             "conf": (views, height, width),
@@ -126,6 +126,8 @@ class Reconstruction:
                 raise FreeGeoError(f"{name} of a reconstruction has the shape {value.shape}, expected {shape}.")
         if len(self.names) != views:
             raise FreeGeoError(f"A reconstruction of {views} views has {len(self.names)} names.")
+        if len(set(self.names)) != views:
+            raise FreeGeoError("Two views of a reconstruction have the same name.")
 
     def __len__(self) -> int:
         """Return the number of views."""

@@ -1,13 +1,17 @@
 """Triangle meshes: area, PLY files, and seeded sampling of surface points."""
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from freegeo.errors import FreeGeoError, UserError
 
 EMPTY_MESH_SEED = 42
+KINDS = ("ply", "obj", "stl", "off")
+"""Kinds of files that meshes are read from, by their endings. Others may hold pictures in any format."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,15 +71,14 @@ def empty_mesh_substitute(count: int) -> np.ndarray:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read a triangle mesh (PLY, OBJ, ...) as stored, without merging vertices.
+    """Read a triangle mesh (`KINDS`) as stored, without merging vertices.
 
     Raises:
-        UserError: there is no such file. FreeGeoError: it holds no triangles.
+        UserError: there is no such file, or it is of another kind. FreeGeoError: it holds no triangles.
     """
     import trimesh
 
-    _require_file(path)
-    loaded = trimesh.load(path, process=False, force="mesh")
+    loaded = load_geometry(path, force="mesh")
     if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
         raise FreeGeoError(f"{path} holds no triangles.")
     return Mesh(vertices=np.asarray(loaded.vertices, np.float64), triangles=np.asarray(loaded.faces, np.int64))
@@ -85,17 +88,28 @@ def read_points(path: Path) -> np.ndarray:
     """Read the points (n, 3) float64 of a PLY cloud (or the vertices of a mesh).
 
     Raises:
-        UserError: there is no such file. FreeGeoError: it holds no points.
+        UserError: there is no such file, or it is of another kind. FreeGeoError: it holds no points.
     """
     import trimesh
 
-    _require_file(path)
-    loaded = trimesh.load(path, process=False)
+    loaded = load_geometry(path)
     if not isinstance(loaded, trimesh.PointCloud | trimesh.Trimesh):
         raise FreeGeoError(f"{path} holds no points.")
     return np.asarray(loaded.vertices, np.float64)
 
 
-def _require_file(path: Path) -> None:
-    if not Path(path).is_file():
+def load_geometry(path: Path, **options: Any) -> Any:
+    """Read one file with trimesh, by its ending, and none that it names: textures of any kind, other meshes, addresses.
+
+    UserError when there is no such file, or it is of another kind than `KINDS`; damaged ones raise what trimesh raises.
+    """
+    import trimesh
+
+    path = Path(path)
+    if not path.is_file():
         raise UserError(f"There is no file {path}.")
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in KINDS:
+        raise UserError(f"{path}: a mesh is read from {', '.join(KINDS)}. Convert it.")
+    # Without the file's path trimesh cannot find what the file refers to.
+    return trimesh.load(io.BytesIO(path.read_bytes()), file_type=kind, process=False, skip_materials=True, **options)

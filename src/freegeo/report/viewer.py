@@ -18,11 +18,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import UserError
 from freegeo.export.mesh import FILE_NAME as MESH_NAME
+from freegeo.export.mesh import load_mesh
 from freegeo.geometry.rotation import matrix_to_quat_xyzw, quat_xyzw_to_wxyz
 from freegeo.report.answer import answer
 from freegeo.report.figures import CONF_MAP, DEPTH_MAP, ERROR_MAP, linear_colours, log_colours, log_range
+from freegeo.report.origin import own_pages_only
 from freegeo.report.result import Result, Stage, load_result, moved
 from freegeo.report.scene3d import ERROR_LIMIT, level_rotation
 
@@ -62,7 +64,7 @@ class Viewer:
         self.layers = _layers(results)
         self.names = list(results[0].names)
         # viser prints its address to stdout, which the command reports itself.
-        with redirect_stdout(io.StringIO()):
+        with redirect_stdout(io.StringIO()), own_pages_only(host):
             self.server = viser.ViserServer(host=host, port=port, label="freegeo", verbose=False)
         self.bands: dict[str, list[Any]] = {}
         self.colours: dict[str, dict[str, list[np.ndarray]]] = {}
@@ -227,7 +229,8 @@ def open_viewer(folders: Sequence[Path], *, host: str = "127.0.0.1", port: int) 
 
     Args:
         folders: output folders; the second is moved and scaled onto the first.
-        host: address to listen on. Other than localhost, everybody who reaches it sees the photos.
+        host: address to listen on. Other than localhost, everybody who reaches it sees the photos. Browsers get the
+            scene for the viewer's own page only (`report.origin`).
         port: to listen on.
 
     Raises:
@@ -351,12 +354,7 @@ def _mesh(layer: Layer) -> Any:
     path = layer.result.folder / MESH_NAME
     if layer.stage is not layer.result.final or not path.is_file():
         return None
-    import trimesh
-
-    try:
-        mesh = trimesh.load_mesh(path, process=False)
-    except (ValueError, IndexError, OSError) as error:
-        raise FreeGeoError(f"{path}: damaged mesh ({error}). Export it again.") from None
+    mesh = load_mesh(path)
     move = layer.result.from_own_frame
     if move is not None:
         mesh.vertices = move.apply(torch.from_numpy(np.asarray(mesh.vertices, dtype=np.float64))).numpy()

@@ -19,8 +19,8 @@ from freegeo import __version__
 from freegeo.data.procedural import get_domain
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import as_json, atomic_path, read_json, write_json, write_tensors
+from freegeo.lock import locked
 from freegeo.models.da3 import Backbone
-from freegeo.run_folder import locked
 from freegeo.training.batches import Batch, draw_batch
 from freegeo.training.config import TrainConfig
 from freegeo.training.objective import objective, zero_motion_rotation

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from freegeo.data.image_files import FORMATS
+from freegeo.data.image_files import opened, stored_values
 from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError, UserError
 
@@ -89,11 +89,12 @@ def require_folder(path: Path, what: str) -> Path:
 
 
 def read_gray(path: Path) -> np.ndarray:
-    """Read a one-channel 8-bit or 16-bit image as stored, (H, W) integers; FreeGeoError when it has more channels."""
-    from PIL import Image
+    """Read a one-channel 8-bit or 16-bit image as stored, (H, W) integers.
 
-    with Image.open(path, formats=FORMATS) as image:
-        values = np.array(image)
+    `UnreadableImageError` when it is damaged or no image, FreeGeoError when it has more channels.
+    """
+    with opened(path) as image:
+        values = stored_values(image, path)
     if values.ndim != 2:
         raise FreeGeoError(f"{path}: a one-channel image was expected, this one has shape {values.shape}.")
     return values.astype(np.int32)
