@@ -9,9 +9,13 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "src" / "freegeo"
 ANYWHERE = {"types", "errors", "files", "lock", "run_folder", "__init__"}
 ALLOWED = {
+    "job": {
+        *("models", "data", "adaptation", "evidence", "fusion", "export", "report"),
+        *("pipeline", "refined", "posed", "metres", "cameras"),
+    },
     "pipeline": {
-        *("models", "data", "adaptation", "evidence", "fusion", "export", "report", "metrics", "geometry", "progress"),
-        *("guarded", "refined", "taught", "posed", "metres", "cameras"),
+        *("models", "data", "adaptation", "evidence", "export", "progress"),
+        *("guarded", "taught", "posed", "metres", "cameras"),
     },
     "posed": {"cameras", "data", "evidence", "export", "geometry", "models"},
     "metres": {"cameras", "data", "export", "geometry"},

@@ -439,13 +439,13 @@ def with_little_depth(found: Reconstruction) -> Reconstruction:
     ],
 )
 def test_broken_predictions_are_trouble_in_any_mode(model, tmp_path, monkeypatch, caplog, guard, broken, words):
-    plain = pipeline._predict
+    plain = pipeline.predict_unchecked
 
     def predicted(model, batch, **options):
         found = walked(plain(model, batch, **options))
         return broken(found) if is_adapted(model) else found
 
-    monkeypatch.setattr(pipeline, "_predict", predicted)
+    monkeypatch.setattr(pipeline, "predict_unchecked", predicted)
     result = freegeo.adapt(model, pictures(), steps=3, sets=2, lr=1e-3, guard=guard)
     assert result.trouble is not None and words in result.trouble and "Lower --lr (now 0.001)" in result.trouble
     assert result.verdict is None

@@ -16,7 +16,7 @@ import trimesh
 from safetensors.numpy import load_file
 
 from cli.conftest import PHOTOS, QUICK
-from freegeo import pipeline
+from freegeo import job, pipeline
 from freegeo.adaptation import adapt as adapting
 from freegeo.adaptation.adapter import is_adapted
 from freegeo.adaptation.state import UNFINISHED_FILE
@@ -259,15 +259,14 @@ def test_an_adapter_that_changes_nothing_gives_the_frozen_result(freegeo, photo_
 def test_numbers_that_are_not_finite_after_adaptation_leave_the_frozen_result(
     freegeo, finished, photo_folder, tiny, tmp_path, monkeypatch
 ):
-    from freegeo import pipeline
-
-    out, plain = tmp_path / "out", pipeline._predict
+    out, plain = tmp_path / "out", pipeline.predict_unchecked
 
     def broken(model, batch, **options):
         found = plain(model, batch, **options)
         return replace(found, depth_z=np.full_like(found.depth_z, np.nan)) if is_adapted(model) else found
 
-    monkeypatch.setattr(pipeline, "_predict", broken)
+    for module in (pipeline, job):
+        monkeypatch.setattr(module, "predict_unchecked", broken)
     for more in ((), ("--formats", "depth")):
         outcome = freegeo("run", photo_folder, "-o", out, *tiny, *QUICK, *more)
         assert outcome.code == 0, outcome.err
@@ -384,7 +383,7 @@ def test_interrupted_run_continues_to_the_same_result(
         if left == 0:
             # Adaptation is complete; the interruption comes while the files are written.
             patch.setattr(formats, "export", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
-            patch.setattr("freegeo.pipeline.export", formats.export)
+            patch.setattr(job, "export", formats.export)
         outcome = freegeo("run", photo_folder, "-o", out, *tiny, *QUICK)
     assert outcome.code == 130
     assert "the same command continues" in outcome.sentence()
@@ -501,7 +500,7 @@ def test_a_run_whose_folder_is_deleted_ends_with_a_sentence_and_makes_nothing_an
     freegeo, photo_folder, tiny, tmp_path, monkeypatch, when
 ):
     out = tmp_path / "out"
-    plain = pipeline.Hooks
+    plain = job.Hooks
 
     def deleting(*, stage, step):
         def told(name):
@@ -511,7 +510,7 @@ def test_a_run_whose_folder_is_deleted_ends_with_a_sentence_and_makes_nothing_an
 
         return plain(stage=told, step=step)
 
-    monkeypatch.setattr(pipeline, "Hooks", deleting)
+    monkeypatch.setattr(job, "Hooks", deleting)
     outcome = freegeo("run", photo_folder, "-o", out, *tiny, *QUICK)
     assert outcome.code == 1
     assert "was removed or replaced while freegeo was writing there" in outcome.sentence()
@@ -520,14 +519,14 @@ def test_a_run_whose_folder_is_deleted_ends_with_a_sentence_and_makes_nothing_an
 
 def test_a_run_that_lost_its_frozen_prediction_is_not_finished(freegeo, photo_folder, tiny, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    plain = pipeline.write_report
+    plain = job.write_report
 
     def report(folder, **options):
         shutil.rmtree(out / "frozen")
         return plain(folder, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "write_report", report)
+        patch.setattr(job, "write_report", report)
         outcome = freegeo("run", photo_folder, "-o", out, *tiny, *QUICK)
         assert outcome.code == 1
         assert "run the command again" in outcome.sentence()

@@ -18,7 +18,7 @@ from freegeo.files import read_json, write_json
 if TYPE_CHECKING:
     from freegeo.data.scene import Scene
     from freegeo.export.reconstruction import Reconstruction
-    from freegeo.pipeline import Job
+    from freegeo.job import Job
 
 SCORES_NAME = "scores.json"
 DEFAULT_RECIPE, DEFAULT_MODEL = RecipeOptions(), DemoModelOptions()

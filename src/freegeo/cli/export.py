@@ -56,8 +56,8 @@ def export(
     from freegeo.export.pixels import masks_for_model
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.files import remove_parts
+    from freegeo.job import FROZEN_FOLDER
     from freegeo.lock import kept_still, locked
-    from freegeo.pipeline import FROZEN_FOLDER
 
     source = source.expanduser()
     stored = source / FROZEN_FOLDER if frozen else source
@@ -122,7 +122,7 @@ def stored_summary(folder: Path) -> dict[str, Any]:
     an object, `warnings` a list; each is empty where the file, or the field, is missing.
     """
     from freegeo.files import read_json
-    from freegeo.pipeline import SUMMARY_NAME
+    from freegeo.job import SUMMARY_NAME
 
     file = folder / SUMMARY_NAME
     content = read_json(file) if file.is_file() else {}

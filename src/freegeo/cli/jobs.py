@@ -35,8 +35,8 @@ from freegeo.run_folder import check_folder, run_folder, stored_state
 
 if TYPE_CHECKING:
     from freegeo.cameras.known import KnownCameras
+    from freegeo.job import Hooks, Job
     from freegeo.metres import ScaleSource
-    from freegeo.pipeline import Hooks, Job
     from freegeo.types import PhotoLike
 
 logger = logging.getLogger(__name__)
@@ -84,7 +84,7 @@ FILES = {
 @contextmanager
 def progress_hooks() -> Generator[Hooks]:
     """Show stages and adaptation steps."""
-    from freegeo.pipeline import Hooks
+    from freegeo.job import Hooks
 
     with step_bar() as on_step:
         yield Hooks(stage=lambda name: console.note(f"{name} ..."), step=on_step)
@@ -117,18 +117,10 @@ def run_job(
     from freegeo.adaptation.adapt import require_unchanged_images
     from freegeo.cameras.undistortion import UndistortedPhoto
     from freegeo.data.video import VideoFrame
+    from freegeo.job import MATCHES_NAME, PARTS, SUMMARY_NAME, Job
     from freegeo.metres import read_scale
     from freegeo.models.images import read_photos
-    from freegeo.pipeline import (
-        MATCHES_NAME,
-        PARTS,
-        SUMMARY_NAME,
-        Job,
-        require_enough_photos,
-        require_pose_from,
-        require_reference,
-        scene_images,
-    )
+    from freegeo.pipeline import require_enough_photos, require_pose_from, require_reference, scene_images
     from freegeo.posed import check_known, is_one_camera, require_cameras, told, undistorted_masks
 
     check_place(output)

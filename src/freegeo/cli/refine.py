@@ -36,9 +36,9 @@ def refine(
     from freegeo.export.measured import save_tracks
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.files import write_json
+    from freegeo.job import MATCHES_NAME, PREDICTION_NAME, SUMMARY_NAME, UNREFINED_FOLDER, write_files
     from freegeo.lock import kept_still
     from freegeo.models.checkpoints import fingerprint
-    from freegeo.pipeline import MATCHES_NAME, PREDICTION_NAME, SUMMARY_NAME, UNREFINED_FOLDER, write_files
     from freegeo.refined import refine_by_photos
     from freegeo.report.page import write_report
     from freegeo.run_folder import run_folder

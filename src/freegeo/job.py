@@ -1,0 +1,495 @@
+"""What `freegeo run` and its kin do with an output folder: photos in, predictions, adapter, files and report out."""
+
+from __future__ import annotations
+
+import logging
+import platform
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from freegeo import __version__
+from freegeo.adaptation import adapter_files
+from freegeo.adaptation.adapt import Progress, loss_change
+from freegeo.adaptation.adapt import adapt as train_adapter
+from freegeo.adaptation.adapter import Adapter
+from freegeo.adaptation.adapter_files import ADAPTER_FOLDER, METADATA
+from freegeo.adaptation.recipe import SEED, Guard, Recipe
+from freegeo.adaptation.samples import SceneImages
+from freegeo.adaptation.state import remove_state
+from freegeo.errors import DivergedError, NoEvidenceError
+from freegeo.evidence.guard import SHARES
+from freegeo.export.base import DEFAULT_FORMATS, TRACKS_NAME
+from freegeo.export.formats import export, filter_reconstruction
+from freegeo.export.kept import save_kept
+from freegeo.export.measured import load_tracks, save_tracks
+from freegeo.export.photos import FOLDER as COPIES_FOLDER
+from freegeo.export.photos import photo_records
+from freegeo.export.pixels import masks_for_model
+from freegeo.export.reconstruction import FILE_NAME as PREDICTION_NAME
+from freegeo.export.reconstruction import Reconstruction
+from freegeo.files import FORMAT, as_json, read_json, remove_written, write_json
+from freegeo.fusion.filtering import FilterReport
+from freegeo.fusion.settings import FilterSettings
+from freegeo.metres import ScaleSource, in_metres
+from freegeo.models.api import ReconstructionModel
+from freegeo.models.precision import Compute
+from freegeo.models.spec import ModelSpec, PoseFrom
+from freegeo.posed import (
+    told,
+    with_known_cameras,
+    with_one_camera,
+)
+from freegeo.refined import refine_by_photos
+from freegeo.report.page import write_report
+from freegeo.run_folder import Part, RunFolder
+from freegeo.types import ImageBatch, PhotoLike, Priors
+
+if TYPE_CHECKING:
+    from freegeo.cameras.known import KnownCameras
+    from freegeo.fusion.tracks import Tracks
+
+from freegeo.pipeline import (
+    CPU,
+    capital,
+    judge_by_photos,
+    not_finite,
+    other_use,
+    predict,
+    predict_unchecked,
+    with_targets,
+)
+
+logger = logging.getLogger(__name__)
+
+SUMMARY_NAME = "reconstruction.json"
+FROZEN_FOLDER = "frozen"
+FILES_STAGE = "points and files"
+MATCHES_NAME = "matches.npz"
+UNREFINED_FOLDER = "unrefined"
+"""Holds what was refined where the result is a refined one, unless that is the frozen prediction."""
+PREDICTED_FOLDER = "predicted"
+"""Holds the model's prediction where known or shared cameras, or a scale, make another result of it, unless that is the
+frozen one of `FROZEN_FOLDER`."""
+ADAPTATION = Part("adaptation", (f"{ADAPTER_FOLDER}/", MATCHES_NAME))
+PREDICTION = Part(
+    "prediction",
+    (
+        f"{FROZEN_FOLDER}/{PREDICTION_NAME}", PREDICTION_NAME, f"{UNREFINED_FOLDER}/{PREDICTION_NAME}",
+        f"{PREDICTED_FOLDER}/{PREDICTION_NAME}", f"{COPIES_FOLDER}/",
+    ),
+)  # fmt: skip
+PLACING = Part("placing", (), free=True)
+REFINEMENT = Part("refinement", (TRACKS_NAME,), free=True)
+FILTERS = Part("filters", ("",), free=True)
+FORMATS = Part("formats", (), free=True)
+PARTS = (ADAPTATION, PREDICTION, PLACING, REFINEMENT, FILTERS, FORMATS)
+"""Parts of a job's settings: photos, model and adapter; how they are used; known and shared cameras, and scale; whether
+bundle adjustment follows; which pixels become points; which files."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hooks:
+    """Callbacks of a run."""
+
+    stage: Callable[[str], None] = lambda name: None
+    step: Callable[[Progress], None] = lambda progress: None
+
+
+@dataclass
+class Job:
+    """The inputs and settings that turn photos into an output folder; parts that already exist are kept."""
+
+    load: Callable[[], ReconstructionModel]
+    """Loads the model; called when something has to be computed with it."""
+    spec: ModelSpec
+    batch: ImageBatch
+    folder: RunFolder
+    recipe: Recipe | None
+    """None: reconstruct with the frozen model, or with `adapter`."""
+    scene: Callable[[ReconstructionModel], SceneImages] | None = None
+    """Makes the images to adapt to (`scene_images`); needed with a recipe."""
+    adapter: Path | None = None
+    """A saved adapter to reconstruct with, instead of training one."""
+    guard: Guard = "select"
+    """Whether the photos' matches judge the adapter, and whether their verdict decides what is used."""
+    known: KnownCameras | None = None
+    """Known cameras of the photos, which the result has as they were given."""
+    priors: Priors | None = None
+    """What the model is told of them (`freegeo.posed.told`)."""
+    one_camera: bool = False
+    """Whether photos of one camera share one focal length."""
+    scale: ScaleSource | None = None
+    """Where metres come from; None: from known cameras or a metric model, if at all."""
+    pose_from: PoseFrom = "camera"
+    """Where the cameras of all predictions come from."""
+    refine: bool = False
+    """Whether the cameras are brought to the matches between the photos by bundle adjustment."""
+    seed: int = SEED
+    compute: Compute = CPU
+    reference: str | None = None
+    """Reference-view rule of all predictions; None: the model's own."""
+    formats: Sequence[str] = DEFAULT_FORMATS
+    """Files to write besides the predictions, names of `freegeo.export.formats.FORMATS`."""
+    photos: Sequence[PhotoLike] | None = None
+    """The photos of the batch, of which some formats write copies."""
+    filters: FilterSettings = field(default_factory=FilterSettings)
+    masks: list[np.ndarray] | None = None
+    """One (H, W) array per photo at its size, not zero where points are wanted."""
+    hooks: Hooks = field(default_factory=Hooks)
+    checkpoint: Mapping[str, str] | None = None
+    """File name and fingerprint of the weights, for reconstruction.json."""
+    command: str | None = None
+    """The command line, for reconstruction.json."""
+    warnings: list[str] = field(default_factory=list)
+    """What makes the result doubtful, one sentence each, for reconstruction.json; may grow until that is written."""
+    after: Callable[[Job], None] = lambda job: None
+    """Called before the folder is marked as finished, to write more."""
+
+    @cached_property
+    def model(self) -> ReconstructionModel:
+        """The frozen model, loaded when it is first used."""
+        return self.load()
+
+    @cached_property
+    def in_place(self) -> Adapter | None:
+        """The adapter of the result, trained or loaded; attached to the model and switched on when first used."""
+        if self.recipe is not None:
+            return adapter_files.load_adapter(self.model, self.folder / ADAPTER_FOLDER)
+        if self.adapter is None:
+            return None
+        about = adapter_files.adapter_metadata(self.adapter) or {}
+        verdict = about.get("verdict") or {}
+        if said := other_use(about, self.priors):
+            self._warn(f"{self.adapter}: {said}")
+        doubt = about.get("trouble") or (verdict.get("reason") if verdict.get("outcome") != "adapted" else None)
+        if doubt:
+            self._warn(f"{self.adapter}: an adapter to be doubted. {capital(doubt)}")
+        return adapter_files.load_adapter(self.model, self.adapter)
+
+    def run(self) -> dict[str, Any]:
+        """Write everything and return the content of reconstruction.json."""
+        frozen, rejected, verdict = None, None, None
+        if self.recipe is None:
+            final = self._predicted(self.folder.path, "adapted prediction" if self.adapter else "prediction")
+        else:
+            frozen = self._predicted(self.folder / FROZEN_FOLDER, "frozen prediction")
+            rejected, verdict = self._trained(self.recipe, frozen)
+            final = frozen
+            if rejected is None and not (verdict and self.guard == "select" and verdict["outcome"] != "adapted"):
+                final, rejected = self._adapted_prediction(frozen)
+        if rejected is not None:
+            self._warn(f"{capital(rejected)} The result is that of the frozen model.")
+        trained = self.recipe is not None and final is not frozen
+        final, about = self._result(final, frozen)
+        report, failed = self._export(final)
+        summary = self._summary(final, report, rejected, verdict, failed, about, trained=trained)
+        write_json(self.folder / SUMMARY_NAME, summary)
+        self.after(self)
+        self.hooks.stage("report")
+        write_report(self.folder.path, photos=self.photos)
+        self.folder.finish()
+        return summary
+
+    def _predicted(self, folder: Path, stage: str) -> Reconstruction:
+        """Predict with the frozen model, or with `adapter`, or read what is there already."""
+        if (folder / PREDICTION_NAME).is_file():
+            return Reconstruction.load(self._predicted_folder if folder == self.folder.path else folder)
+        if self.adapter is not None:
+            assert self.in_place is not None
+        with self._timed(stage):
+            result = predict(
+                self.model,
+                self.batch,
+                reference=self.reference,
+                priors=self.priors,
+                pose_from=self.pose_from,
+                compute=self.compute,
+            )
+            result.save(folder)
+        return result
+
+    def _trained(self, recipe: Recipe, frozen: Reconstruction) -> tuple[str | None, dict[str, Any] | None]:
+        """Train the adapter, or continue training it, unless it is finished, and let the guard judge it.
+
+        Returns why it cannot be used, and the verdict; both may be None.
+        """
+        folder = self.folder / ADAPTER_FOLDER
+        noted = self._noted("adaptation")
+        if "failed" in noted:
+            return noted["failed"], None
+        if not (folder / METADATA).is_file():
+            assert self.scene is not None
+            images, judging, stores = [self.scene(self.model)], None, [self.folder / MATCHES_NAME]
+            try:
+                if recipe.cameras:
+                    assert self.photos is not None
+                    self.hooks.stage("cameras to learn from")
+                    images, _, judging = with_targets(
+                        self.model, images, [(self.photos, self.batch)], seed=self.seed, compute=self.compute,
+                        frozen=[frozen], stores=stores,
+                    )  # fmt: skip
+                self.hooks.stage("adaptation")
+                result = train_adapter(
+                    self.model, images, recipe, seed=self.seed, compute=self.compute,
+                    resume_in=folder, on_step=self.hooks.step, keep_after=() if self.guard == "off" else SHARES,
+                )  # fmt: skip
+            except (DivergedError, NoEvidenceError) as error:
+                remove_state(folder)
+                self.folder.note("adaptation", {**noted, "failed": str(error)})
+                return str(error), None
+            self.in_place = result.adapter
+            seconds = {"adaptation": round(result.seconds, 2)}
+            if self.photos is not None and result.trouble is None:
+                self.hooks.stage(
+                    "evidence of the photos" if self.guard != "off" else "comparison with the frozen model"
+                )
+                started = time.monotonic()
+                judge_by_photos(
+                    self.model, result, [(self.photos, self.batch)], compute=self.compute, guard=self.guard,
+                    reference=self.reference, frozen=[frozen], stores=stores, judging=judging, priors=[self.priors],
+                    pose_from=self.pose_from,
+                )  # fmt: skip
+                seconds["evidence"] = round(time.monotonic() - started, 2)
+            result.save(folder)
+            self.folder.note("adaptation", {"seconds": seconds})
+        metadata = read_json(folder / METADATA)
+        return metadata.get("trouble"), metadata.get("verdict")
+
+    def _adapted_prediction(self, frozen: Reconstruction) -> tuple[Reconstruction, str | None]:
+        """Predict with the trained adapter; the frozen prediction and the reason when that gives no usable numbers."""
+        path = self.folder.path
+        if (path / PREDICTION_NAME).is_file():
+            rejected = self._noted("prediction").get("rejected")
+            return (Reconstruction.load(self._predicted_folder), None) if rejected is None else (frozen, rejected)
+        assert self.in_place is not None
+        with self._timed("adapted prediction"):
+            result = predict_unchecked(
+                self.model,
+                self.batch,
+                reference=self.reference,
+                priors=self.priors,
+                pose_from=self.pose_from,
+                compute=self.compute,
+            )
+            rejected = not_finite(result)
+            if rejected is None:
+                result.save(path)
+        if rejected is None:
+            return result, None
+        rejected = f"With the adapter: {rejected}"
+        self.folder.note("prediction", {**self._noted("prediction"), "rejected": rejected})
+        return frozen, rejected
+
+    @property
+    def _predicted_folder(self) -> Path:
+        """Folder of the model's prediction, whatever the result made of it."""
+        places = (self.folder / PREDICTED_FOLDER, self.folder / UNREFINED_FOLDER)
+        return next((place for place in places if (place / PREDICTION_NAME).is_file()), self.folder.path)
+
+    def _result(
+        self, predicted: Reconstruction, frozen: Reconstruction | None
+    ) -> tuple[Reconstruction, dict[str, Any]]:
+        """Make the result of a prediction, and see that it is in the folder; returns facts for reconstruction.json."""
+        path, kept, before = self.folder.path, self.folder / PREDICTED_FOLDER, self.folder / UNREFINED_FOLDER
+        placed, about = self._placed(predicted)
+        changed = placed is not predicted or self.scale is not None
+        if changed and predicted is not frozen and not (kept / PREDICTION_NAME).is_file():
+            predicted.save(kept)
+        if self.refine and self._is_refined(placed, frozen, is_frozen=predicted is frozen):
+            return Reconstruction.load(path), about
+        result, _ = self._in_metres(placed)
+        if changed or predicted is frozen or self._predicted_folder != path:
+            result.save(path)
+        remove_written(before)
+        if not changed:
+            remove_written(kept)
+        return result, about
+
+    def _placed(self, predicted: Reconstruction) -> tuple[Reconstruction, dict[str, Any]]:
+        """Give a prediction known and shared cameras; it comes back as it is where there is nothing to do."""
+        about: dict[str, Any] = {"known_cameras": None, "one_camera": None}
+        if self.known is not None:
+            posed = with_known_cameras(predicted, self.known)
+            predicted = posed.result
+            about["known_cameras"] = {**posed.about, "model": told(self.known, self.batch, self.spec)[1]}
+        if self.one_camera:
+            assert self.photos is not None
+            predicted, about["one_camera"] = with_one_camera(predicted, self.photos, self.known)
+        return predicted, about
+
+    def _in_metres(self, result: Reconstruction, tracks: Tracks | None = None) -> tuple[Reconstruction, Tracks | None]:
+        """Bring a result, and points measured in it, to metres where that is asked for."""
+        if self.scale is None:
+            return result, tracks
+        assert self.photos is not None
+        metric = in_metres(result, self.scale, self.photos)
+        if tracks is not None and metric is not result:
+            assert metric.scale is not None
+            tracks = replace(tracks, xyz=tracks.xyz * metric.scale.value)
+        return metric, tracks
+
+    def _is_refined(self, placed: Reconstruction, frozen: Reconstruction | None, *, is_frozen: bool) -> bool:
+        """Refine a prediction, unless that is done, and write what comes of it where it is accepted."""
+        path, before = self.folder.path, self.folder / UNREFINED_FOLDER
+        if "accepted" not in self._noted("refinement"):
+            assert self.photos is not None
+            with self._timed("refinement", REFINEMENT):
+                found = refine_by_photos(
+                    placed, self.photos, frozen=None if is_frozen else frozen, store=self.folder / MATCHES_NAME,
+                    device=str(self.compute.device),
+                    again=partial(self._told, is_frozen=is_frozen) if self.spec.takes == "cameras" else None,
+                )  # fmt: skip
+                if found.tracks is not None:
+                    if placed is not frozen:
+                        placed.save(before)
+                    result, tracks = self._in_metres(found.result, found.tracks)
+                    assert tracks is not None
+                    save_tracks(path, tracks)
+                    result.save(path)
+                self.folder.note("refinement", {**self._noted("refinement"), **found.about})
+            logger.info("%s: %s", "refined" if found.tracks is not None else "not refined", found.about["reason"])
+        return self._noted("refinement")["accepted"]
+
+    def _told(self, priors: Priors, *, is_frozen: bool) -> Reconstruction | None:
+        """Predict again with the model of the result, which is told cameras; None without finite numbers."""
+        # The adapter of a result that is the frozen model's may still be in place.
+        adapter = vars(self).get("in_place") if is_frozen else self.in_place
+        with adapter.off() if is_frozen and adapter is not None else nullcontext():
+            found = predict_unchecked(
+                self.model, self.batch, reference=None, priors=priors, pose_from="camera", compute=self.compute
+            )
+        return found if not_finite(found) is None else None
+
+    def _warn(self, sentence: str) -> None:
+        """Log a warning that reconstruction.json must hold, whoever listens to the log."""
+        logger.warning("%s", sentence)
+        if sentence not in self.warnings:
+            self.warnings.append(sentence)
+
+    def _export(self, final: Reconstruction) -> tuple[FilterReport | None, Mapping[str, str]]:
+        """Filter each reconstruction once and write all formats; returns as `write_files`."""
+        with self._timed(FILES_STAGE, FILTERS):
+            masks = None if self.masks is None else masks_for_model(final, self.masks)
+            return write_files(
+                self.folder.path, final, self.formats, filters=self.filters, masks=masks, photos=self.photos,
+                seed=self.seed,
+            )  # fmt: skip
+
+    def _summary(
+        self,
+        final: Reconstruction,
+        report: FilterReport | None,
+        rejected: str | None,
+        verdict: Mapping[str, Any] | None,
+        failed: Mapping[str, str],
+        about: Mapping[str, Any],
+        *,
+        trained: bool,
+    ) -> dict[str, Any]:
+        settings = dict(self.folder.settings)
+        seconds = {name: value for part in self.folder.notes.values() for name, value in part["seconds"].items()}
+        return {
+            "format": FORMAT,
+            "model": self.spec.name,
+            "checkpoint": self.checkpoint,
+            "licence_of_weights": self.spec.weights_licence,
+            "images": list(final.names),
+            "photo_files": None if self.photos is None else photo_records(self.photos),
+            "image_hw": list(final.image_hw),
+            "scale": None if final.scale is None else asdict(final.scale),
+            "adapter": ADAPTER_FOLDER if trained else (str(self.adapter) if self.adapter else None),
+            "rejected_adapter": None if trained or self.recipe is None else rejected or (verdict or {}).get("reason"),
+            "verdict": verdict,
+            "refinement": {k: v for k, v in self._noted("refinement").items() if k != "seconds"} or None,
+            **about,
+            "frozen_prediction": None if self.recipe is None else f"{FROZEN_FOLDER}/{PREDICTION_NAME}",
+            "reference_view": "first" if self.priors is not None else self.reference or self.spec.reference,
+            "pose_from": self.pose_from if self.spec.cameras else None,
+            "not_written": dict(failed),
+            "warnings": list(self.warnings),
+            "loss": self._loss_change(),
+            "filters": None if report is None else {"pixels": report.pixels, "removed": dict(report.removed)},
+            "recipe": None if self.recipe is None else as_json(asdict(self.recipe)),
+            "settings": settings,
+            "command": self.command,
+            "seconds": seconds,
+            "versions": versions(),
+        }
+
+    def _noted(self, part: str) -> dict[str, Any]:
+        return self.folder.notes.get(part) or {"seconds": {}}
+
+    def _loss_change(self) -> dict[str, float] | None:
+        """Return the mean total loss of the first and last tenth of the steps."""
+        metadata = self.folder / ADAPTER_FOLDER / METADATA
+        if self.recipe is None or not metadata.is_file():
+            return None
+        return loss_change(read_json(metadata)["loss_curve"])
+
+    @contextmanager
+    def _timed(self, stage: str, part: Part = PREDICTION) -> Generator[None]:
+        """Announce a stage and note how long it took, also for processes that continue this run."""
+        self.hooks.stage(stage)
+        started = time.monotonic()
+        yield
+        noted = self._noted(part.name)
+        seconds = {**noted["seconds"], stage: round(time.monotonic() - started, 2)}
+        self.folder.note(part.name, {**noted, "seconds": seconds})
+
+
+def write_files(
+    folder: Path,
+    result: Reconstruction,
+    formats: Sequence[str],
+    *,
+    filters: FilterSettings | None = None,
+    masks: np.ndarray | None = None,
+    photos: Sequence[PhotoLike] | None = None,
+    seed: int = SEED,
+) -> tuple[FilterReport | None, Mapping[str, str]]:
+    """Choose the points of a result and of the predictions before it, and write the result's files.
+
+    Args:
+        folder: holds the result, and in subfolders the predictions before adaptation and before refinement, if any.
+        result: what is in the folder.
+        formats: names of `freegeo.export.formats.FORMATS`.
+        filters: which points are kept; None: the defaults.
+        masks: (S, H, W) bool, pixels that the user wants; None: all.
+        photos: the photos, of which some formats write copies.
+        seed: of the random choice of points.
+
+    Returns:
+        What the filters removed (None without cameras, which have no points), and why formats were not written.
+    """
+    filtered = None
+    if result.has_cameras:
+        for name in (FROZEN_FOLDER, UNREFINED_FOLDER):
+            if (folder / name / PREDICTION_NAME).is_file():
+                before = Reconstruction.load(folder / name)
+                save_kept(folder / name, filter_reconstruction(before, masks=masks, settings=filters), masks)
+        filtered = filter_reconstruction(result, masks=masks, settings=filters)
+        save_kept(folder, filtered, masks)
+    exported = export(
+        result,
+        folder,
+        formats,
+        filtered=filtered,
+        masks=masks,
+        photos=photos,
+        tracks=load_tracks(folder, len(result)),
+        seed=seed,
+    )
+    return None if filtered is None else filtered[1], exported.failed
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on."""
+    return {"freegeo": __version__, "torch": torch.__version__, "python": platform.python_version()}
