@@ -23,7 +23,7 @@ from freegeo.models.da3_config import NESTED_KEYS, SINGLE_VIEW_KEYS  # noqa: E40
 from freegeo.models.da3_metric import METRIC_DEPTH, METRIC_SKY, SKY, DA3Nested, fill_sky, quantile  # noqa: E402
 from freegeo.models.spec import ModelEntry  # noqa: E402
 from freegeo.pipeline import predict  # noqa: E402
-from freegeo.types import Features, ImageBatch  # noqa: E402
+from freegeo.types import Features, ImageBatch, Priors  # noqa: E402
 from parity_da3 import build_nested, small_config  # noqa: E402
 from tiny_models import attach, noise, outputs, same, tiny_da3, tiny_nested, tiny_single_view, trained  # noqa: E402
 
@@ -84,7 +84,7 @@ def test_what_a_single_view_model_cannot_do_is_refused():
     with pytest.raises(UserError, match="does not predict cameras"):
         model.decode(features, want=("depth", "cameras"))
     with pytest.raises(UserError, match="takes no known cameras"):
-        model.aggregate(model.embed(IMAGES[None]), cameras=object())
+        model.aggregate(model.embed(IMAGES[None]), priors=Priors())
     with pytest.raises(UserError, match="reference"):
         model.aggregate(model.embed(IMAGES[None]), reference="best")
 
