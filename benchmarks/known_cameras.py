@@ -4,8 +4,9 @@ Run: python benchmarks/known_cameras.py [--domains test-id,big,...] [--rooms 25]
          [--checkpoint FILE] [--out FILE]
 
 For each room, the first photos of the path. `told`: the model is told the true cameras and predicts its own; `posed`:
-the result with the known cameras, as `freegeo run --cameras` writes it; `after`: the model sees the photos alone, and
-the known cameras are used after prediction. `--steps 0` leaves adaptation out. Printed: means of the frozen model, and
+the same with the known cameras in place of these, and the scale that their distances give; `measured`: with depth
+brought to the points that matches measure, as `freegeo run --cameras` writes it. `after` and `after, measured`: the
+model sees the photos alone, and the known cameras are used after prediction. `--steps 0` leaves adaptation out. Printed: means of the frozen model, and
 changes against it with their intervals, paired over rooms.
 """
 
@@ -25,12 +26,13 @@ import freegeo
 from freegeo.cameras.known import KnownCamera, KnownCameras
 from freegeo.data.procedural import get_domain, photograph_room
 from freegeo.data.scene import Scene
+from freegeo.evidence.matches import Matches, find_matches
 from freegeo.metrics.bootstrap import paired_interval
 from freegeo.metrics.scene import evaluate
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.images import read_photos
 from freegeo.pipeline import predict
-from freegeo.posed import priors_of, with_known_cameras
+from freegeo.posed import priors_of, with_known_cameras, with_measured_depth
 
 DOMAINS = "test-id,big,tex,sparse"
 SCORES = ("auc05", "auc15", "auc30", "f1_rel5", "abs_rel")
@@ -50,16 +52,21 @@ def cameras_of(scene: Scene) -> KnownCameras:
     return KnownCameras(names=names, cameras=tuple(cameras), source=scene.name, metric=True)
 
 
-def scores_of(model: ReconstructionModel, scene: Scene, known: KnownCameras, way: str) -> dict[str, dict[str, float]]:
+def scores_of(
+    model: ReconstructionModel, scene: Scene, known: KnownCameras, matches: Matches, way: str
+) -> dict[str, dict[str, float]]:
     """Score the model as it is, alone and with the cameras."""
     batch = read_photos(model, scene.photos)
     alone = predict(model, batch)
     told = predict(model, batch, priors=priors_of(known, batch))
+    after, posed = with_known_cameras(alone, known), with_known_cameras(told, known)
     found = {
         way: alone,
-        f"{way}, after": with_known_cameras(alone, known).result,
+        f"{way}, after": after.result,
+        f"{way}, after, measured": with_measured_depth(after, known, matches).result,
         f"{way}, told": told,
-        f"{way}, posed": with_known_cameras(told, known).result,
+        f"{way}, posed": posed.result,
+        f"{way}, measured": with_measured_depth(posed, known, matches).result,
     }
     return {name: {metric: float(evaluate(one, scene)[metric]) for metric in SCORES} for name, one in found.items()}
 
@@ -69,10 +76,11 @@ def room(model: ReconstructionModel, seed: int, domain: str, views: int, steps: 
     whole = photograph_room(seed, domain, frames=max(16, views))
     scene = whole.select(range(views))
     known = cameras_of(scene)
-    scores = scores_of(model, scene, known, "frozen")
+    matches = find_matches(scene.photos)
+    scores = scores_of(model, scene, known, matches, "frozen")
     for way, cameras in (("adapted", None), ("adapted with cameras", known)) if steps else ():
         result = freegeo.adapt(model, scene.photos, steps=steps, guard="off", cameras=cameras, trust_cameras=True)
-        scores |= scores_of(model, scene, known, way)
+        scores |= scores_of(model, scene, known, matches, way)
         result.adapter.detach()
     return {"domain": domain, "seed": seed, "views": views, "scores": scores}
 

@@ -11,7 +11,7 @@ ANYWHERE = {"types", "errors", "files", "lock", "run_folder", "__init__"}
 ALLOWED = {
     "job": {
         *("models", "data", "adaptation", "evidence", "fusion", "export", "report"),
-        *("pipeline", "refined", "posed", "metres", "cameras"),
+        *("pipeline", "guarded", "refined", "posed", "metres", "cameras"),
     },
     "pipeline": {
         *("models", "data", "adaptation", "evidence", "export", "progress"),

@@ -10,12 +10,14 @@ import torch
 from PIL import Image
 
 import freegeo
+from evidence_tools import exact_matches, without_matches
 from exact_rooms import room
 from freegeo.adaptation.samples import Samples, SceneImages
 from freegeo.adaptation.state import UNFINISHED_FILE
 from freegeo.adaptation.views import schedule
 from freegeo.cameras.known import KnownCamera, KnownCameras, Lens
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.evidence.candidate import Candidate
 from freegeo.export.pixels import corner_K
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import read_json
@@ -23,7 +25,17 @@ from freegeo.geometry.rotation import quat_xyzw_to_matrix
 from freegeo.geometry.se3 import camera_centres, from_Rt
 from freegeo.geometry.sim3 import Sim3
 from freegeo.models.precision import Compute
-from freegeo.posed import digest, fit_cameras, known_cameras, priors_of, told, undistorted_masks, with_known_cameras
+from freegeo.posed import (
+    digest,
+    fit_cameras,
+    is_measurable,
+    known_cameras,
+    priors_of,
+    told,
+    undistorted_masks,
+    with_known_cameras,
+    with_measured_depth,
+)
 from tiny_models import attach, noise, quick, same, tensors, tiny_da3, tiny_nested, tiny_single_view, tiny_vggt
 
 VIEWS = 5
@@ -404,3 +416,39 @@ def test_masks_follow_their_undistorted_photos(photos):
         assert ((photo.read()[..., 0] > 127) == mask).mean() > 0.9
     assert (undistorted_masks(pattern, straight)[0] != pattern[0]).mean() > 0.05
     assert undistorted_masks(None, straight) is None
+
+
+# -- depth by measured points
+
+
+def test_measured_points_bring_each_view_s_depth_to_the_known_cameras():
+    scene = room(views=6, hw=(72, 96), seed=5)
+    known, matches = known_of(scene, metric=True), exact_matches(Candidate.of(scene), noise_px=0.2)
+    wrong = np.array([0.8, 0.9, 1.0, 1.1, 1.2, 1.4], np.float32)[:, None, None]
+    before = predicted(scene)
+    posed = with_known_cameras(replace(before, depth_z=before.depth_z * wrong), known)
+    assert is_measurable(posed, known)
+    found = with_measured_depth(posed, known, matches)
+    off = np.median(found.result.depth_z / scene.depth_z, axis=(1, 2))
+    assert np.abs(off - 1).max() < 0.01 < np.abs(np.median(posed.result.depth_z / scene.depth_z, axis=(1, 2)) - 1).max()
+    assert np.array_equal(found.result.T_cam_world, posed.result.T_cam_world)
+    measured = found.about["measured"]
+    assert measured["views"] == 6 and measured["points"] > 30
+    assert found.result.scale.value == pytest.approx(posed.result.scale.value * measured["factor"])
+    assert found.result.scale.spread == measured["spread"]
+
+
+def test_without_points_depth_keeps_the_scale_of_the_cameras_and_says_so(caplog):
+    scene = room(views=6, hw=(72, 96), seed=5)
+    known = known_of(scene)
+    posed = with_known_cameras(predicted(scene), known)
+    found = with_measured_depth(posed, known, without_matches(exact_matches(Candidate.of(scene))))
+    assert np.array_equal(found.result.depth_z, posed.result.depth_z) and found.about["measured"] is None
+    assert "too few points could be measured" in caplog.text
+
+
+@pytest.mark.parametrize("part", [{"poses": (0, 1, 2, 3)}, {"K": (0,)}])
+def test_points_are_measured_with_whole_cameras_only(part):
+    scene = room(views=6, hw=(72, 96), seed=5)
+    known = known_of(scene, **part)
+    assert not is_measurable(with_known_cameras(predicted(scene), known), known)

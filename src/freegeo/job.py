@@ -38,13 +38,16 @@ from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import FORMAT, as_json, read_json, remove_written, write_json
 from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
+from freegeo.guarded import scene_matches
 from freegeo.metres import ScaleSource, in_metres
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
 from freegeo.models.spec import ModelSpec, PoseFrom
 from freegeo.posed import (
+    is_measurable,
     told,
     with_known_cameras,
+    with_measured_depth,
     with_one_camera,
 )
 from freegeo.refined import refine_by_photos
@@ -318,6 +321,11 @@ class Job:
         about: dict[str, Any] = {"known_cameras": None, "one_camera": None}
         if self.known is not None:
             posed = with_known_cameras(predicted, self.known)
+            if is_measurable(posed, self.known):
+                assert self.photos is not None
+                store, device = self.folder / MATCHES_NAME, str(self.compute.device)
+                matches = scene_matches(self.photos, predicted, store, device=device)
+                posed = with_measured_depth(posed, self.known, matches)
             predicted = posed.result
             about["known_cameras"] = {**posed.about, "model": told(self.known, self.batch, self.spec)[1]}
         if self.one_camera:

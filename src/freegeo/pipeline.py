@@ -26,7 +26,7 @@ from freegeo.evidence.bundle import pycolmap_module
 from freegeo.evidence.guard import SHARES
 from freegeo.evidence.matches import Matches
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.guarded import Evidence, harm, judge_adapter
+from freegeo.guarded import Evidence, harm, judge_adapter, scene_matches
 from freegeo.metres import in_metres, read_scale
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import EMBEDDED_MODEL, warn_of_embedded_model
@@ -35,11 +35,13 @@ from freegeo.models.precision import Compute
 from freegeo.models.spec import MIXED, Mixed, ModelSpec, PoseFrom
 from freegeo.posed import (
     check_known,
+    is_measurable,
     is_one_camera,
     known_cameras,
     require_cameras,
     told,
     with_known_cameras,
+    with_measured_depth,
     with_one_camera,
 )
 from freegeo.progress import step_bar
@@ -183,7 +185,7 @@ def reconstruct(
     compute = Compute.choose(device, precision)
     if cameras is not None or scale is not None:
         require_cameras(model.spec)
-    found, known = _with_cameras(load_photos(photos, max_views), cameras, trust=trust_cameras)
+    found, known, matches = _with_cameras(load_photos(photos, max_views), cameras, trust=trust_cameras)
     source = None if scale is None else read_scale(scale, found)
     batch = read_photos(model, found, mixed=mixed)
     priors = _told(known, batch, model.spec)
@@ -194,7 +196,12 @@ def reconstruct(
     with _applied(model, adapter):
         result = predict(model, batch, reference=reference, priors=priors, pose_from=pose_from, compute=compute)
     if known is not None:
-        result = with_known_cameras(result, known).result
+        posed = with_known_cameras(result, known)
+        if is_measurable(posed, known):
+            if matches is None:
+                matches = scene_matches(found, result, None, device=str(compute.device))
+            posed = with_measured_depth(posed, known, matches)
+        result = posed.result
     if is_one_camera(found) if one_camera is None else one_camera:
         result, _ = with_one_camera(result, found, known)
     return result if source is None else in_metres(result, source, found)
@@ -202,22 +209,20 @@ def reconstruct(
 
 def _with_cameras(
     photos: Sequence[PhotoLike], cameras: KnownCameras | str | Path | None, *, trust: bool
-) -> tuple[Sequence[PhotoLike], KnownCameras | None]:
-    """Return the photos with their cameras, which are checked unless they are trusted.
+) -> tuple[Sequence[PhotoLike], KnownCameras | None, Matches | None]:
+    """Return the photos with their cameras, which matches check unless they are trusted, and these matches.
 
     UserError for distortion: exports write the photos that they are given, which would be the caller's distorted ones.
     """
     if cameras is None:
-        return photos, None
+        return photos, None, None
     seen, known = known_cameras(photos, cameras)
     if any(new is not old for new, old in zip(seen, photos, strict=True)):
         raise UserError(
             f"{known.source}: the photos have distortion. Undistort them, and use the new photos from then on: photos, "
             "known = freegeo.cameras.undistortion.undistorted(photos, known)."
         )
-    if not trust:
-        check_known(known, photos)
-    return photos, known
+    return photos, known, None if trust else check_known(known, photos)
 
 
 def _told(known: KnownCameras | None, batch: ImageBatch, spec: ModelSpec) -> Priors | None:
@@ -352,7 +357,7 @@ def adapt(
         pycolmap_module()
     found = load_photos(photos, max_views)
     require_enough_photos(found)
-    found, known = _with_cameras(found, cameras, trust=trust_cameras)
+    found, known, _ = _with_cameras(found, cameras, trust=trust_cameras)
     batch = read_photos(model, found, mixed=mixed)
     priors = _told(known, batch, model.spec)
     images = [scene_images("photos", found, model, plan, batch, priors)]

@@ -20,7 +20,8 @@ from freegeo.data.image_files import UnreadableImageError, opened
 from freegeo.data.photos import some_of
 from freegeo.data.video import VideoFrame
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.evidence.matches import ALL_PAIRS_UP_TO, find_matches, stored_matches
+from freegeo.evidence.matches import ALL_PAIRS_UP_TO, Matches, find_matches, stored_matches
+from freegeo.evidence.refinement import measured_depth
 from freegeo.export.photos import own_file
 from freegeo.export.pixels import HALF
 from freegeo.export.reconstruction import Reconstruction, Scale
@@ -91,13 +92,14 @@ def require_near(known: KnownCameras) -> None:
         )
 
 
-def check_known(known: KnownCameras, photos: Sequence[PhotoLike], store: Path | None = None) -> None:
+def check_known(known: KnownCameras, photos: Sequence[PhotoLike], store: Path | None = None) -> Matches | None:
     """Check known poses by matches between the photos: UserError where they do not fit, a warning without evidence.
 
-    `store` is the file for the matches of a scene, which is read where it is there, and written when they fit.
+    `store` is the file for the matches of a scene, which is read where it is there, and written when they fit. Returns
+    the matches where they are of all pairs of photos.
     """
     if known.has_pose.sum() < 2:
-        return
+        return None
     pairs = pairs_to_check(len(photos))
     # Of more photos other pairs are matched later, by what the prediction says that they see of each other.
     store = store if len(photos) <= ALL_PAIRS_UP_TO else None
@@ -108,6 +110,7 @@ def check_known(known: KnownCameras, photos: Sequence[PhotoLike], store: Path | 
     logger.info("%s", found.sentence)
     if store is not None and not is_there:
         matches.save(store)
+    return matches if len(photos) <= ALL_PAIRS_UP_TO else None
 
 
 def digest(known: KnownCameras) -> str:
@@ -217,7 +220,9 @@ class Posed:
     result: Reconstruction
     about: Mapping[str, Any]
     """JSON-like: `source`, `poses` and `intrinsics` (how many are known), `metric`, `scale`, `spread`, `rotation_deg`,
-    `position` (`Fit`), `focal` (median ratio of known to predicted focal lengths); None where there is none."""
+    `position` (`Fit`), `focal` (median ratio of known to predicted focal lengths); None where there is none. With
+    `with_measured_depth` also `measured`: `points`, `views` with enough of them, `factor` and `spread` over the views;
+    None where too few were measured."""
 
 
 def with_known_cameras(prediction: Reconstruction, known: KnownCameras) -> Posed:
@@ -264,6 +269,36 @@ def with_known_cameras(prediction: Reconstruction, known: KnownCameras) -> Posed
     }  # fmt: skip
     result = replace(prediction, depth_z=depth_z, T_cam_world=T.numpy(), K=K.numpy(), scale=scale)
     return Posed(result=result, about=about)
+
+
+def is_measurable(posed: Posed, known: KnownCameras) -> bool:
+    """Whether matches can measure points with known cameras: those of all photos are known, from different places."""
+    return bool(known.has_pose.all() and known.has_K.all()) and posed.about["scale"] is not None
+
+
+def with_measured_depth(posed: Posed, known: KnownCameras, matches: Matches) -> Posed:
+    """Bring depth to the points that matches measure with known cameras (`is_measurable`).
+
+    A network's depth and its cameras differ in scale, and each view's depth has a factor of its own: where distances of
+    cameras alone give the scale, surfaces lie beside each other.
+    """
+    found = measured_depth(posed.result, matches)
+    if found is None:
+        logger.warning(
+            "%s: too few points could be measured with the known cameras: depth keeps the scale that the distances "
+            "between cameras give it.",
+            known.source,
+        )
+        return replace(posed, about={**posed.about, "measured": None})
+    own = found.factors[found.own]
+    factor, spread = float(np.median(own)), NORMAL * float(np.median(np.abs(np.log(own / np.median(own)))))
+    scale = posed.result.scale
+    if scale is not None:
+        scale = replace(scale, value=scale.value * factor, spread=spread)
+    about = {"points": found.points, "views": int(found.own.sum()), "factor": factor, "spread": spread}
+    return Posed(
+        result=replace(posed.result, depth_z=found.depth_z, scale=scale), about={**posed.about, "measured": about}
+    )
 
 
 def _doubt_poses(fit: Fit, known: KnownCameras, scale: Scale | None) -> None:

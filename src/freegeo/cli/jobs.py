@@ -291,7 +291,10 @@ def say_known(about: dict[str, Any]) -> None:
     """Print what known cameras made of the prediction."""
     parts = [f"poses of {about['poses']} and intrinsics of {about['intrinsics']} photos as given"]
     if about["scale"] is not None:
-        parts.append(f"depth times {about['scale']:.4g}")
+        measured = about.get("measured")
+        factor = 1 if measured is None else measured["factor"]
+        by = "" if measured is None else f" (by {measured['points']:,} points that matches measure with these cameras)"
+        parts.append(f"depth times {about['scale'] * factor:.4g}{by}")
     if about["rotation_deg"] is not None:
         far = "" if about["position"] is None else f", {100 * about['position']:.2g} % of the longest distance"
         parts.append(f"predicted cameras differed by {about['rotation_deg']:.2g} degrees{far} in the median")

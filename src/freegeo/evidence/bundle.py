@@ -21,14 +21,14 @@ from freegeo.errors import UserError
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.matches import Matches
 from freegeo.evidence.scores import depth_at
-from freegeo.evidence.tracks import MeasuredTracks, triangulate
+from freegeo.evidence.tracks import MeasuredTracks, join_matches, triangulate
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.geometry.camera import project
 from freegeo.geometry.depth import valid_depth
 from freegeo.geometry.rotation import rotation_angle
 from freegeo.geometry.se3 import inverse, relative, transform_points
 
-__all__ = ["BundleSettings", "Solution", "Start", "cluster", "depth_of", "shared_cameras", "solve"]
+__all__ = ["BundleSettings", "Solution", "Start", "cluster", "depth_of", "measure", "shared_cameras", "solve"]
 
 Start = Literal["rays", "depth"]
 """Where the points of the first adjustment come from: rays of the predicted cameras, or the predicted depth."""
@@ -176,6 +176,17 @@ def solve(
     found = [(_adjusted(candidate, camera, matches, tracks, start, settings), start) for start in starts]
     known = [(solution, start) for solution, start in found if solution is not None]
     return min(known, key=lambda one: one[0].cost + DEPTH_WEIGHT * one[0].depth_spread, default=None)
+
+
+def measure(
+    candidate: Candidate, matches: Matches, settings: BundleSettings | None = None
+) -> tuple[MeasuredTracks, np.ndarray]:
+    """Return the tracks that fit a candidate's cameras as they are, and their points (n, 3): nothing is adjusted."""
+    settings = settings or BundleSettings()
+    tracks = join_matches(matches)
+    xyz, error, wide = _triangulated(candidate, matches, tracks, settings)
+    chosen, alive = _selected(tracks, (error <= settings.narrowest_px) & wide[tracks.point])
+    return chosen, xyz[alive]
 
 
 def depth_of(candidate: Candidate, tracks: MeasuredTracks) -> Tensor:

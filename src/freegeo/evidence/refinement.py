@@ -13,7 +13,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from freegeo.evidence.bundle import BundleSettings, Solution, Start, cluster, shared_cameras, solve
+from freegeo.evidence.bundle import (
+    BundleSettings,
+    Solution,
+    Start,
+    cluster,
+    depth_of,
+    measure,
+    shared_cameras,
+    solve,
+)
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.matches import Matches
 from freegeo.evidence.scores import depth_at, epipolar
@@ -23,7 +32,16 @@ from freegeo.fusion.tracks import Tracks
 from freegeo.geometry.depth import valid_depth
 from freegeo.geometry.se3 import inverse, relative, transform_points
 
-__all__ = ["RefineSettings", "Refinement", "bring_depth", "depth_misfit", "parallax_px", "refine"]
+__all__ = [
+    "MeasuredDepth",
+    "RefineSettings",
+    "Refinement",
+    "bring_depth",
+    "depth_misfit",
+    "measured_depth",
+    "parallax_px",
+    "refine",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -197,16 +215,11 @@ def bring_depth(
     if not refinement.accepted or tracks is None or T_cam_world is None or K is None:
         raise ValueError(f"a refinement that was not accepted is not used: {refinement.reason}")
     measured, predicted = _depths(reconstruction, tracks, T_cam_world)
-    known = np.isfinite(measured) & np.isfinite(predicted)
-    counts = np.bincount(tracks.view[known], minlength=len(reconstruction))
-    own = counts >= FEWEST_DEPTHS
-    factors = np.full(len(reconstruction), np.nan)
-    for view in np.flatnonzero(own).tolist():
-        rows = known & (tracks.view == view)
-        factors[view] = np.median(measured[rows] / predicted[rows])
-    factors[~own] = np.median(factors[own]) if own.any() else 1.0
+    factors, own = _view_factors(measured, predicted, tracks.view, len(reconstruction))
     depth_z = reconstruction.depth_z * factors[:, None, None].astype(np.float32)
     if affine:
+        known = np.isfinite(measured) & np.isfinite(predicted)
+        counts = np.bincount(tracks.view[known], minlength=len(reconstruction))
         for view in np.flatnonzero(counts >= FEWEST_AFFINE).tolist():
             rows = known & (tracks.view == view)
             depth_z[view] = _affine(
@@ -220,6 +233,59 @@ def bring_depth(
         )  # fmt: skip
     moved = replace(reconstruction, depth_z=depth_z, T_cam_world=T_cam_world.astype(np.float32), K=K.astype(np.float32))
     return moved, without
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MeasuredDepth:
+    """Depth brought to points that matches measure with known cameras."""
+
+    depth_z: np.ndarray
+    """(S, H, W) float32."""
+    factors: np.ndarray
+    """(S,) by which each view's depth was multiplied."""
+    own: np.ndarray
+    """(S,) bool: views with enough points for a factor of their own; the others have the median one."""
+    points: int
+    """How many points were measured."""
+
+
+def measured_depth(
+    reconstruction: Reconstruction, matches: Matches, settings: BundleSettings | None = None
+) -> MeasuredDepth | None:
+    """Bring depth to what matches measure with a reconstruction's cameras, which are known and stay as they are.
+
+    Each view's depth is multiplied as by `bring_depth`. None with fewer than 30 points, or none where depth is known.
+    """
+    settings = settings or BundleSettings()
+    if not len(matches.pairs):
+        return None
+    candidate = Candidate.of(reconstruction)
+    tracks, xyz = measure(candidate, matches, settings)
+    if len(tracks) < settings.fewest_tracks:
+        return None
+    measured = transform_points(candidate.T_cam_world[tracks.view], torch.from_numpy(xyz)[tracks.point])[:, 2].numpy()
+    factors, own = _view_factors(measured, depth_of(candidate, tracks).numpy(), tracks.view, len(reconstruction))
+    if not own.any():
+        return None
+    depth_z = (reconstruction.depth_z * factors[:, None, None]).astype(np.float32)
+    return MeasuredDepth(depth_z=depth_z, factors=factors, own=own, points=len(tracks))
+
+
+def _view_factors(
+    measured: np.ndarray, predicted: np.ndarray, view: np.ndarray, views: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Factor (S,) of each view, the median of measured / predicted depth (m,) of the observations of views `view` (m,).
+
+    Views with few get the median of the others; the mask (S,) says which have one of their own.
+    """
+    known = np.isfinite(measured) & np.isfinite(predicted)
+    own = np.bincount(view[known], minlength=views) >= FEWEST_DEPTHS
+    factors = np.full(views, np.nan)
+    for one in np.flatnonzero(own).tolist():
+        rows = known & (view == one)
+        factors[one] = np.median(measured[rows] / predicted[rows])
+    factors[~own] = np.median(factors[own]) if own.any() else 1.0
+    return factors, own
 
 
 def depth_misfit(reconstruction: Reconstruction, refinement: Refinement) -> float:
