@@ -6,8 +6,8 @@ Run: python benchmarks/known_cameras.py [--domains test-id,big,...] [--rooms 25]
 For each room, the first photos of the path. `told`: the model is told the true cameras and predicts its own; `posed`:
 the same with the known cameras in place of these, and the scale that their distances give; `measured`: with depth
 brought to the points that matches measure, as `freegeo run --cameras` writes it. `after` and `after, measured`: the
-model sees the photos alone, and the known cameras are used after prediction. `--steps 0` leaves adaptation out. Printed: means of the frozen model, and
-changes against it with their intervals, paired over rooms.
+model sees the photos alone, and the known cameras are used after prediction. `--steps 0` leaves adaptation out.
+Printed: means of the frozen model, and changes against it with their intervals, paired over rooms.
 """
 
 import os
