@@ -35,6 +35,12 @@ def test_training_leaves_weights_and_a_learning_curve_and_goes_on(freegeo, tmp_p
     assert "| val-light (2) | 8->4 |" in scored.out
     assert "auc30 0." in scored.out and "not reached" in scored.out
     assert list(json.loads(card.read_text())["domains"]) == ["val-id", "val-light"]
+    known = freegeo(
+        "models", "score", "freegeo-tiny", "--cameras", "--checkpoint", run / loop.WEIGHTS, "--domains", "val-id",
+        "--rooms", 2, "-o", card,
+    )  # fmt: skip
+    assert known.code == 0, known.err
+    assert "| val-id (2) | 8 | given |" in known.out
     assert "no-such" in freegeo("models", "score", "freegeo-tiny", "--domains", "no-such").sentence()
     again = freegeo("train-tiny", run, "--views", 40)
     assert again.code == 0

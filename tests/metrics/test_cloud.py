@@ -71,6 +71,12 @@ def test_f1_rel5_does_not_see_a_similarity():
     assert score.overall < 1e-4
 
 
+def test_f1_rel5_moves_nothing_that_is_posed():
+    depth, K, T = _small_scene()
+    assert f1_rel5(depth, K, T, depth, K, T, posed=True).fscore == 1
+    assert f1_rel5(1.3 * depth, K, T, depth, K, T, posed=True).fscore < 0.5
+
+
 def test_f1_rel5_asks_for_the_points_of_all_views():
     depth, K, T = _small_scene()
     kept = (0, 2, 4, 6)

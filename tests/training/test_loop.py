@@ -115,7 +115,22 @@ def test_a_run_continues_another_one_with_rooms_and_rates_of_its_own(tmp_path, s
     assert 60 < resumed[0] <= 64 + 4
 
 
+def test_a_part_of_a_weight_file_learns_and_the_rest_stays_bit_equal(tmp_path, small_config, whole_run):
+    config = replace(small_config, views=60, learns="cam_enc.", cameras_given=1.0)
+    before, after = tensors(whole_run), tensors(train(config, tmp_path / "next", continue_from=whole_run))
+    assert before.keys() == after.keys()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed and all(name.startswith("model.cam_enc.") for name in changed)
+    with safe_open(whole_run, "pt") as file:
+        begun = [int(file.metadata()[name]) for name in ("step", "views")]
+    assert read_json(tmp_path / "next" / loop.CONFIG)["begin"] == begun
+
+
 def test_mistakes_about_the_run_to_continue_are_named(tmp_path, small_config, whole_run):
+    with pytest.raises(UserError, match="needs one to start from"):
+        train(replace(small_config, learns="cam_enc."), tmp_path / "part")
+    with pytest.raises(UserError, match="not weights of shape 'v5'"):
+        train(replace(small_config, shape="v5"), tmp_path / "shape", continue_from=whole_run)
     with pytest.raises(UserError, match="no run to continue"):
         train(small_config, tmp_path / "next", continue_from=tmp_path)
     with pytest.raises(UserError, match="continues no other"):

@@ -14,6 +14,7 @@ from freegeo.training.objective import (
     Choice,
     camera_terms,
     camera_tokens,
+    camera_unit,
     cell_depth_term,
     cell_targets,
     depth_terms,
@@ -128,6 +129,28 @@ def test_confidence_is_best_where_it_says_what_the_error_is(batch):
     assert gradient.abs() < 1e-5
 
 
+def test_the_distances_of_the_cameras_give_the_unit_of_the_depth(batch):
+    encoding = true_encoding(batch)
+    torch.testing.assert_close(camera_unit(camera_reader(encoding), features_of(batch), batch), torch.ones(2))
+    encoding[..., :3] *= torch.tensor([2.0, 0.8])[:, None, None]
+    unit = camera_unit(camera_reader(encoding), features_of(batch), batch)
+    torch.testing.assert_close(unit, torch.tensor([0.5, 1.25]), atol=0.05, rtol=0)
+
+
+def test_depth_by_cameras_sees_their_scale_and_no_common_one(batch):
+    state = new_state(TrainConfig(depth_views=2))
+    config = TrainConfig(depth_views=2, depth_by_cameras=True, learns="cam_enc.", cameras_given=1.0)
+
+    def depth_term(factor):
+        scaled = replace(batch, T_world_cam=batch.T_world_cam.clone(), depth_z=batch.depth_z * factor)
+        scaled.T_world_cam[..., :3, 3] *= factor
+        told = replace(scaled, cameras_given=torch.tensor([True, True]))
+        return objective(state.model, state.read_outs, told, config, 0, torch.Generator().manual_seed(0))["depth"]
+
+    # A fresh model predicts no distance, which counts as the smallest baseline.
+    torch.testing.assert_close(depth_term(2.0), depth_term(1.0), atol=0.05, rtol=0)
+
+
 def test_objective_reaches_every_parameter_that_training_owns(batch):
     config = TrainConfig(depth_views=1)
     state = new_state(config)
@@ -150,7 +173,7 @@ def test_choice_takes_one_view_of_some_samples(batch):
 def test_given_cameras_reach_their_samples_only_and_train_the_encoder(batch):
     state = new_state(TrainConfig())
     told = replace(batch, cameras_given=torch.tensor([False, True]))
-    tokens, learned = camera_tokens(state.model, told), camera_tokens(state.model, batch)
+    tokens, learned = (camera_tokens(state.model, one, torch.Generator().manual_seed(0)) for one in (told, batch))
     assert torch.equal(tokens[0], learned[0]) and not torch.allclose(tokens[1], learned[1])
     image_hw = tuple(batch.images.shape[-2:])
     poses, K = se3.normalise_poses(se3.inverse(batch.T_world_cam)), K_from_fov(*batch.fov_vh.unbind(-1), image_hw)
@@ -160,3 +183,17 @@ def test_given_cameras_reach_their_samples_only_and_train_the_encoder(batch):
     terms = objective(state.model, state.read_outs, told, config, 1, torch.Generator().manual_seed(0))
     torch.stack(list(terms.values())).sum().backward()
     assert all(parameter.grad is not None for parameter in state.model.cam_enc.parameters())
+
+
+def test_the_unit_of_given_cameras_is_seen_with_two_views_only(batch):
+    model = new_state(TrainConfig()).model
+    told = replace(batch, cameras_given=torch.tensor([True, True]))
+    pair = replace(
+        told, images=told.images[:, :2], T_world_cam=told.T_world_cam[:, :2], fov_vh=told.fov_vh[:, :2],
+        depth_z=told.depth_z[:, :2],
+    )  # fmt: skip
+    first, second = (torch.Generator().manual_seed(seed) for seed in (0, 1))
+    assert not torch.allclose(camera_tokens(model, pair, first), camera_tokens(model, pair, second), atol=1e-3)
+    torch.testing.assert_close(
+        camera_tokens(model, told, first), camera_tokens(model, told, second), atol=1e-3, rtol=0
+    )  # fmt: skip

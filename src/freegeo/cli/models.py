@@ -165,10 +165,11 @@ def score(
     output: Annotated[Path, Parameter(name=("--output", "-o"))] = Path("report-card.json"),
     domains: str | None = None,
     rooms: int = 200,
+    cameras: bool = False,
 ) -> None:
     """Score a model on generated rooms: 4 views, 8 views, and 4 views read off the features of 8.
 
-    This is the report card of docs/embedded-model.md; it runs on the CPU.
+    These are the report cards of docs/embedded-model.md; they run on the CPU.
 
     Parameters
     ----------
@@ -182,14 +183,18 @@ def score(
         Kinds of rooms, separated by commas, the kind of the training first; default: all that are reported.
     rooms
         Rooms of each domain.
+    cameras
+        Score instead what the true cameras are worth: 4 and 8 views without cameras and with them.
     """
     from freegeo.cli.options import use_few_threads
     from freegeo.data.procedural import get_domain
     from freegeo.errors import UserError
+    from freegeo.training.camera_card import CAMERA_DOMAINS, camera_card, camera_tables
     from freegeo.training.report_card import REPORTED_DOMAINS, card_tables, gate_lines, report_card
     from freegeo.training.state import trained_model
 
-    names = REPORTED_DOMAINS if domains is None else tuple(name.strip() for name in domains.split(","))
+    reported = CAMERA_DOMAINS if cameras else REPORTED_DOMAINS
+    names = reported if domains is None else tuple(name.strip() for name in domains.split(","))
     if rooms < 1:
         raise UserError(f"--rooms must be at least 1, got {rooms}.")
     for name in names:
@@ -202,10 +207,9 @@ def score(
         raise UserError(f"{loaded.spec.name} predicts no cameras, which the report card scores. Choose another model.")
     use_few_threads(loaded)
     with progress_bar("domains", len(names)) as update:
-        card = report_card(
+        card = (camera_card if cameras else report_card)(
             loaded, output, side=loaded.spec.default_side, domains=dict.fromkeys(names, rooms),
             on_domain=lambda name: update(names.index(name), name),
         )  # fmt: skip
-    console.say(card_tables(card))
-    console.say("\n".join(gate_lines(card)))
+    console.say(camera_tables(card) if cameras else "\n".join([card_tables(card), *gate_lines(card)]))
     console.say(f"numbers: {output}")

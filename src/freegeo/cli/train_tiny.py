@@ -36,7 +36,8 @@ def train_tiny(
     output
         Folder of the run: state, log, rendered rooms, weights.
     preset
-        v4, the shipped weights' recipe for the CPU, or v5, that of the next version for a GPU.
+        v4, the shipped weights' recipe for the CPU; v4-cameras, that of their camera encoder, which starts from the
+        rest of them; or v5, that of the next version for a GPU.
     views
         Views to learn from, counted with repetition; default: those of the shipped recipe.
     minutes
@@ -54,7 +55,8 @@ def train_tiny(
     views_per_step
         Views that each step learns from.
     continue_from
-        Folder of another run; this one starts where that one stands, with these settings and rooms.
+        Folder of another run, or a weight file (.safetensors); this one starts where that one stands, with these
+        settings and rooms.
     peak
         Factor on all learning rates; about 0.2 for a run that continues a finished one.
     cooldown

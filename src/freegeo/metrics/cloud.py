@@ -163,6 +163,7 @@ def f1_rel5(
     T_cam_world_gt: Tensor,
     *,
     views: tuple[int, ...] | None = None,
+    posed: bool = False,
 ) -> CloudScore:
     """Score of a small reconstruction with a threshold of 5 % of the mean ground-truth depth.
 
@@ -177,6 +178,7 @@ def f1_rel5(
         K_gt: see `depth_gt`.
         T_cam_world_gt: see `depth_gt`.
         views: the ground-truth view of each predicted one; by default the first S.
+        posed: the prediction has the cameras of the ground truth, so it is not moved.
 
     Raises:
         UserError: the shapes do not fit, or a prediction has no pixel with a valid depth on both sides.
@@ -190,10 +192,12 @@ def f1_rel5(
             f"{tuple(depth_gt.shape)}."
         )
     T_gt = T_cam_world_gt.double()
-    R, s, t = _coarse_similarity(
-        depth_pred.double(), T_cam_world_pred.double(), depth_gt[chosen].double(), T_gt[chosen]
-    )
-    predicted = s * _world_points(depth_pred, K_pred, T_cam_world_pred) @ R.mT + t
+    predicted = _world_points(depth_pred, K_pred, T_cam_world_pred)
+    if not posed:
+        R, s, t = _coarse_similarity(
+            depth_pred.double(), T_cam_world_pred.double(), depth_gt[chosen].double(), T_gt[chosen]
+        )
+        predicted = s * predicted @ R.mT + t
     seen = depth_gt[valid_depth(depth_gt)].double()
     return score_clouds(
         predicted.cpu().numpy(),

@@ -61,6 +61,9 @@ class TrainConfig:
 
     shape: str = "v4"
     """Which of `SHAPES`."""
+    learns: str = ""
+    """Beginning of the names of the parameters that learn, such as "cam_enc."; the others keep their values. Empty: all
+    parameters, and the maps that are only there for training."""
     minutes: float = 0.0
     """Time that the run's schedule fits in, all legs together; the cool-down then ends by itself. 0: no limit."""
     views: int = 700_000
@@ -108,6 +111,8 @@ class TrainConfig:
     """Share of the samples whose reference is any of its views instead of one end of the walk."""
     cameras_given: float = 0.0
     """Share of the samples whose cameras are given to the model, which trains its camera encoder."""
+    depth_by_cameras: bool = False
+    """Compare depth in the unit of the true cameras, to which the predicted cameras bring it by their distances."""
     depth_views: int = 8
     """Views that the dense head learns from in one step, at most one of each sample."""
     ray_branch_every: int = 8
@@ -187,5 +192,20 @@ PRESETS = {
         broken_steps=20,
         weights=LossWeights(field_of_view=3.0),
     ),
+    "v4-cameras": TrainConfig(
+        learns="cam_enc.",
+        cameras_given=1.0,
+        views=1_070_000,
+        views_per_step=24,
+        peak=0.4,
+        cooldown=0.7,
+        rooms=960,
+        first_room=20_000,
+        depth_by_cameras=True,
+        depth_views=12,
+        evaluate_every=0,
+        weights=LossWeights(depth=6.0, absolute=2.0, rotation=1.0),
+    ),
 }
-"""Settings by name: those of the shipped weights on the CPU, and those of the next version on a GPU."""
+"""Settings by name: those of the shipped weights on the CPU, of the next version on a GPU, and of the camera encoder in
+the shipped weights, whose run starts from the rest of them."""

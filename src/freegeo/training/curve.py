@@ -35,7 +35,9 @@ def plot_learning_curve(log: Path, figure: Path) -> Path:
     canvas, axes = pyplot.subplots(2, 2, figsize=(11, 7), sharex=True, constrained_layout=True)
     seen = [line["views"] / 1000 for line in steps]
     for name in ("translation", "points", "matching", "depth", "field_of_view"):
-        axes[0, 0].plot(seen, [line[name] for line in steps], label=name.replace("_", " "))
+        # A run in which only a part of the model learns has fewer losses.
+        if all(name in line for line in steps):
+            axes[0, 0].plot(seen, [line[name] for line in steps], label=name.replace("_", " "))
     axes[0, 0].set(title="Weighted losses (running mean)", yscale="log")
     axes[0, 1].plot(seen, [line["rotation"] / line["zero_motion"] for line in steps], color="black")
     axes[0, 1].axhline(1, linestyle=":", color="grey")

@@ -38,6 +38,7 @@ from freegeo.training.state import (
     resume,
     save,
     save_restart,
+    save_start,
 )
 from freegeo.training.workers import Crew
 
@@ -67,9 +68,9 @@ def train(
     The same call continues a stopped run: with one worker it ends with the same tensors as a run that was never
     stopped. A larger `views` continues from the plateau before the cool-down. `workers` processes of one thread each
     change the shared weights without locks; on another device than the CPU there is one. `compile_blocks` compiles the
-    blocks of the backbone first. `continue_from` is the folder of another run, whose state this one starts from, with
-    settings and rooms of its own. UserError when the folder holds a run with other settings or `continue_from` holds
-    none; FreeGeoError when too many losses are not finite or a worker dies.
+    blocks of the backbone first. `continue_from` is the folder of another run or a weight file, whose state this one
+    starts from, with settings and rooms of its own. UserError when the folder holds a run with other settings or
+    `continue_from` holds none; FreeGeoError when too many losses are not finite or a worker dies.
     """
     begun = time.monotonic()
     if workers < 1 or (workers > 1 and device != "cpu"):
@@ -282,12 +283,23 @@ def begin(config: TrainConfig, folder: Path, continue_from: Path | None) -> Trai
         if (folder / CONFIG).is_file():
             raise UserError(f"{folder}: holds a run that continues no other. Choose a new folder.")
         source = next((path for name in (NEWEST_FILE, RESTART_FILE) if (path := continue_from / name).is_file()), None)
-        if source is None:
+        if continue_from.suffix == ".safetensors":
+            save_start(continue_from, config, start)
+        elif source is None:
             source = continue_from / NEWEST_FILE
-            raise UserError(f"{source}: not found, so there is no run to continue. Name the folder of a training run.")
-        with atomic_path(start) as part:
-            shutil.copyfile(source, part)
+            raise UserError(
+                f"{source}: not found, so there is no run to continue. Name the folder of a training run, or a weight "
+                "file that ends in .safetensors."
+            )
+        else:
+            with atomic_path(start) as part:
+                shutil.copyfile(source, part)
     if not start.is_file():
+        if config.learns:
+            raise UserError(
+                f"{folder}: this run changes only a part of a model ({config.learns}*), so it needs one to start from. "
+                "Name its weight file or its run with --continue-from."
+            )
         return config
     steps, views, *_ = torch.load(start, weights_only=True, map_location="cpu", mmap=True)["counters"].tolist()
     if config.views <= views:

@@ -6,6 +6,7 @@ Letters: B samples, S views, P patches, Q cells (2 x 2 a patch), C channels.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import cast, overload
 
@@ -38,6 +39,8 @@ VISIBLE_WITHIN = 0.06
 """Relative depth difference up to which a point counts as seen by the other view."""
 CONFIDENCE_TARGET = 0.3
 """The optimal confidence for a log-depth error e is this number over e."""
+GIVEN_UNITS = (1.0, 6.0)
+"""Smallest and largest mean depth of a sample in the unit of the cameras that the model is given."""
 
 
 class ReadOuts(nn.Module):
@@ -95,24 +98,28 @@ def objective(
     """Return all weighted terms of one step, scalars; their sum is the loss."""
     weights = config.weights
     device_type = batch.images.device.type
-    first_tokens = camera_tokens(model, batch) if config.cameras_given else None
+    first_tokens = camera_tokens(model, batch, generator) if config.cameras_given else None
     with torch.autocast(device_type, torch.bfloat16, enabled=device_type == "cuda"):
         features = encode(model, batch.images, first_tokens)
     features = as_float32(features)
     terms = camera_terms(model, features, batch, config)
-    geometry = geometry_terms(read_outs, features, batch)
-    terms["rays"] = weights.rays * geometry[0]
-    terms["points"] = weights.points * geometry[1]
-    terms["cell_depth"] = weights.cell_depth * cell_depth_term(read_outs, features, batch)
-    terms["matching"] = weights.matching * matching_term(read_outs, features, batch)
-    terms["position"] = weights.position * position_term(read_outs, features, batch)
+    if not config.learns:
+        geometry = geometry_terms(read_outs, features, batch)
+        terms["rays"] = weights.rays * geometry[0]
+        terms["points"] = weights.points * geometry[1]
+        terms["cell_depth"] = weights.cell_depth * cell_depth_term(read_outs, features, batch)
+        terms["matching"] = weights.matching * matching_term(read_outs, features, batch)
+        terms["position"] = weights.position * position_term(read_outs, features, batch)
     samples, views = batch.images.shape[:2]
     chosen = Choice(
         samples=to_device(torch.randperm(samples, generator=generator)[: config.depth_views], batch.images.device),
         view=int(torch.randint(views, (), generator=generator)),
     )
-    terms |= depth_terms(*read_depth(model, chosen.of(features)), chosen.of(batch.depth_z), config)
-    if step % config.ray_branch_every == 0:
+    depth_z, conf = read_depth(model, chosen.of(features))
+    if config.depth_by_cameras:
+        depth_z = depth_z * camera_unit(model, features, batch)[chosen.samples, None, None, None]
+    terms |= depth_terms(depth_z, conf, chosen.of(batch.depth_z), config)
+    if not config.learns and step % config.ray_branch_every == 0:
         terms["ray_branch"] = weights.ray_branch * ray_branch_term(model, chosen.of(features), batch, chosen)
     return terms
 
@@ -125,9 +132,16 @@ def encode(model: DA3, images: Tensor, first_tokens_BSD: Tensor | None) -> Featu
     return Features(levels=levels, image_hw=tokens.image_hw, grid_hw=tokens.grid_hw)
 
 
-def camera_tokens(model: DA3, batch: Batch) -> Tensor:
-    """Return the first tokens (B, S, D): encoded cameras where a sample's cameras are given, else the learned ones."""
-    T_world_cam = se3.inverse(se3.normalise_poses(se3.inverse(batch.T_world_cam)))
+def camera_tokens(model: DA3, batch: Batch, generator: torch.Generator) -> Tensor:
+    """Return the first tokens (B, S, D): encoded cameras where a sample's cameras are given, else the learned ones.
+
+    The cameras come in a random unit, because nobody knows that of a user's: with two views it does not fall out.
+    """
+    low, high = (math.log(unit) for unit in GIVEN_UNITS)
+    unit = torch.empty(len(batch.images), 1, 1).uniform_(low, high, generator=generator).exp()
+    T_world_cam = batch.T_world_cam.clone()
+    T_world_cam[..., :3, 3] *= to_device(unit, T_world_cam.device)
+    T_world_cam = se3.inverse(se3.normalise_poses(se3.inverse(T_world_cam)))
     quat = matrix_to_quat_xyzw(T_world_cam[..., :3, :3])
     encoded = model.cam_enc(torch.cat([T_world_cam[..., :3, 3], quat, batch.fov_vh], dim=-1))
     backbone = cast(Backbone, model.backbone["pretrained"])
@@ -162,8 +176,7 @@ def as_float32(features: Features) -> Features:
 
 def camera_terms(model: DA3, features: Features, batch: Batch, config: TrainConfig) -> dict[str, Tensor]:
     """Compare camera encodings: relative motion of all ordered pairs, motion from view 0, field of view."""
-    encoding = model.cam_dec(features.levels[model.config.out_layers[-1]][1][..., 0, :])
-    t, quat, fov = encoding.split([3, 4, 2], dim=-1)
+    t, quat, fov = camera_encoding(model, features).split([3, 4, 2], dim=-1)
     R = quat_xyzw_to_matrix(quat)
     R_true, t_true = batch.T_world_cam[..., :3, :3], batch.T_world_cam[..., :3, 3]
     R_pairs, t_pairs = relative_motion(R, t)
@@ -180,6 +193,21 @@ def camera_terms(model: DA3, features: Features, batch: Batch, config: TrainConf
         "absolute": weights.absolute * absolute,
         "field_of_view": weights.field_of_view * (fov - batch.fov_vh).abs().mean(),
     }
+
+
+def camera_encoding(model: DA3, features: Features) -> Tensor:
+    """Return the nine numbers (B, S, 9) of the predicted cameras."""
+    return model.cam_dec(features.levels[model.config.out_layers[-1]][1][..., 0, :])
+
+
+def camera_unit(model: DA3, features: Features, batch: Batch) -> Tensor:
+    """Return the factor (B,) that brings the distances of the predicted cameras to the true ones: a geometric mean."""
+    first, second = torch.triu_indices(*[batch.images.shape[1]] * 2, 1, device=batch.images.device)
+    true, predicted = (
+        (t[:, first] - t[:, second]).norm(dim=-1).clamp_min(SMALLEST_BASELINE).log().mean(1)
+        for t in (batch.T_world_cam[..., :3, 3], camera_encoding(model, features)[..., :3])
+    )
+    return (true - predicted).exp()
 
 
 def zero_motion_rotation(batch: Batch) -> Tensor:

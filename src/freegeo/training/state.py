@@ -14,6 +14,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
+from freegeo.errors import UserError
 from freegeo.files import atomic_path
 from freegeo.models.catalog import EMBEDDED_MODEL
 from freegeo.models.checkpoints import build_on_meta, find_file, load_weights
@@ -105,7 +106,7 @@ class State:
 
 
 def new_state(config: TrainConfig, device: torch.device | str = "cpu") -> State:
-    """Build model, training-only read-outs and optimisers from the seed."""
+    """Build model, training-only read-outs and optimisers from the seed; what does not learn has no gradients."""
     generator = torch.Generator().manual_seed(config.seed)
     model = build_shape(config.shape).to_empty(device="cpu")
     reset_norms(model)
@@ -114,6 +115,8 @@ def new_state(config: TrainConfig, device: torch.device | str = "cpu") -> State:
     start_camera_decoder(model)
     read_outs = ReadOuts(model.config.channels)
     initialise(read_outs, generator)
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_(name.startswith(config.learns))
     model, read_outs = model.to(device), read_outs.to(device)
     average = {name: value.detach().clone() for name, value in model.named_parameters()}
     optimisers = build_optimisers(model, read_outs, config)
@@ -225,6 +228,21 @@ def save(state: State, config: TrainConfig, path: Path) -> None:
     """Write the whole state atomically."""
     with atomic_path(path) as part:
         torch.save({**state.tensors(), "cooldown_start": config.cooldown_start}, part)
+
+
+def save_start(weights: Path, config: TrainConfig, path: Path) -> None:
+    """Write the state of a run that starts with the weights of a file, after the steps and views that the file names.
+
+    Half precision, as `save_restart`, so weights that a run leaves as they are stay those of a file like ours.
+    """
+    if trained_shape(find_file(weights)) != config.shape:
+        raise UserError(f"{weights}: not weights of shape '{config.shape}', which this run trains. Name another file.")
+    state = new_state(config)
+    state.model.load_state_dict(trained_model(weights).state_dict())
+    with safe_open(weights, "pt") as file:
+        metadata = file.metadata() or {}
+    state.counters[:2] = torch.tensor([float(metadata.get(name, 0)) for name in ("step", "views")])
+    save_restart(state, path)
 
 
 def save_restart(state: State, path: Path) -> None:
