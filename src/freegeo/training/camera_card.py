@@ -22,7 +22,7 @@ from freegeo.metrics.depth import score_depth
 from freegeo.models.api import ReconstructionModel
 from freegeo.training.pool import Rooms, image_size
 from freegeo.training.report_card import ALL_VIEWS, ASPECT, KEPT, ROOMS_PER_BATCH, evaluation_rooms, given, score_room
-from freegeo.types import Cameras, Prediction
+from freegeo.types import Prediction, Priors
 
 VIEWS = {"4": KEPT, "8": tuple(range(ALL_VIEWS))}
 WITHOUT, WITH = "without", "given"
@@ -92,10 +92,10 @@ def predict_both(model: ReconstructionModel, batch: Rooms, views: tuple[int, ...
     chosen = list(views)
     tokens = model.embed(batch.images[:, chosen].float() / 255)
     K = K_from_fov(*batch.fov_vh[:, chosen].unbind(-1), tokens.image_hw)
-    cameras = Cameras(T_cam_world=se3.normalise_poses(batch.T_cam_world[:, chosen]), K=K)
+    cameras = Priors(T_cam_world=batch.T_cam_world[:, chosen], K=K, metric=True)
     return {
         WITHOUT: model.decode(model.aggregate(tokens)),
-        WITH: model.decode(model.aggregate(tokens, cameras=cameras)),
+        WITH: model.decode(model.aggregate(tokens, priors=cameras)),
     }
 
 
