@@ -27,6 +27,7 @@ from freegeo.geometry.sim3 import Sim3
 from freegeo.models.precision import Compute
 from freegeo.posed import (
     digest,
+    doubt_focal_length,
     fit_cameras,
     is_measurable,
     known_cameras,
@@ -452,3 +453,20 @@ def test_points_are_measured_with_whole_cameras_only(part):
     scene = room(views=6, hw=(72, 96), seed=5)
     known = known_of(scene, **part)
     assert not is_measurable(with_known_cameras(predicted(scene), known), known)
+
+
+# -- EXIF data
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1.0, False), (1.2, False), (1.6, True), (0.5, True)])
+def test_focal_lengths_far_from_the_exif_data_are_doubted(tmp_path, caplog, factor, said):
+    scene = room(views=4)
+    height, width = scene.photo_hw[0].tolist()
+    focal = float(scene.photo_K()[0, 0, 0]) * factor
+    exif = Image.Exif()
+    equivalent = focal / np.hypot(height, width) * np.hypot(36, 24)
+    exif.get_ifd(0x8769)[0xA405] = round(equivalent)
+    for k in range(4):
+        Image.new("RGB", (width, height), (40 * k, 90, 30)).save(tmp_path / f"{k}.jpg", exif=exif)
+    doubt_focal_length(scene, freegeo.load_photos(tmp_path))
+    assert ("EXIF data" in caplog.text) is said

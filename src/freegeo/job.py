@@ -44,6 +44,7 @@ from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
 from freegeo.models.spec import ModelSpec, PoseFrom
 from freegeo.posed import (
+    doubt_focal_length,
     is_measurable,
     told,
     with_known_cameras,
@@ -192,6 +193,8 @@ class Job:
             self._warn(f"{capital(rejected)} The result is that of the frozen model.")
         trained = self.recipe is not None and final is not frozen
         final, about = self._result(final, frozen)
+        if self.photos is not None:
+            doubt_focal_length(final, self.photos)
         report, failed = self._export(final)
         summary = self._summary(final, report, rejected, verdict, failed, about, trained=trained)
         write_json(self.folder / SUMMARY_NAME, summary)

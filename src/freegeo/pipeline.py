@@ -35,6 +35,7 @@ from freegeo.models.precision import Compute
 from freegeo.models.spec import MIXED, Mixed, ModelSpec, PoseFrom
 from freegeo.posed import (
     check_known,
+    doubt_focal_length,
     is_measurable,
     is_one_camera,
     known_cameras,
@@ -204,6 +205,7 @@ def reconstruct(
         result = posed.result
     if is_one_camera(found) if one_camera is None else one_camera:
         result, _ = with_one_camera(result, found, known)
+    doubt_focal_length(result, found)
     return result if source is None else in_metres(result, source, found)
 
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from freegeo.cameras.convention import check_convention, pairs_to_check
+from freegeo.cameras.exif import exif_focal
 from freegeo.cameras.known import KnownCameras
 from freegeo.cameras.reading import read_cameras
 from freegeo.cameras.undistortion import UndistortedPhoto, undistorted
@@ -46,6 +47,8 @@ DOUBTFUL_DEG, DOUBTFUL_SHARE, DOUBTFUL_SPREAD, DOUBTFUL_FOCAL = 10.0, 0.2, 0.3, 
 """From here on a difference between predicted and known cameras is a warning: median angle, median distance as a share
 of the longest one between known cameras, spread of the pairs' scale, and relative difference of focal lengths."""
 _EXIF, _CAMERA_TAGS, _FOCAL_TAGS = 0x8769, (0x010F, 0x0110), (0x920A, 0xA405)
+EXIF_FACTOR = 1.3
+"""Factor, up or down, from which on EXIF data and a result contradict each other: both are wrong by some per cent."""
 NORMAL = 1.4826
 """Standard deviation of a normal distribution in its median absolute deviations."""
 
@@ -299,6 +302,26 @@ def with_measured_depth(posed: Posed, known: KnownCameras, matches: Matches) -> 
     return Posed(
         result=replace(posed.result, depth_z=found.depth_z, scale=scale), about={**posed.about, "measured": about}
     )
+
+
+def doubt_focal_length(result: Reconstruction, photos: Sequence[PhotoLike]) -> None:
+    """Warn when a result's focal lengths are far from those that the photos' EXIF data say."""
+    if not result.has_cameras:
+        return
+    focal = result.photo_K()[:, (0, 1), (0, 1)].mean(axis=1)
+    ratios = [
+        known / found
+        for photo, found in zip(photos, focal, strict=True)
+        if (file := own_file(photo)) is not None
+        and not isinstance(photo, UndistortedPhoto)
+        and (known := exif_focal(file, photo.size_hw)) is not None
+    ]
+    if ratios and not 1 / EXIF_FACTOR < (ratio := float(np.median(ratios))) < EXIF_FACTOR:
+        logger.warning(
+            "The EXIF data of the photos say a focal length %.2f times that of the result: if they are right, shapes "
+            "are stretched along the view. Intrinsics that are known can be given with --cameras.",
+            ratio,
+        )
 
 
 def _doubt_poses(fit: Fit, known: KnownCameras, scale: Scale | None) -> None:
