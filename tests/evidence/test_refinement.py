@@ -329,7 +329,7 @@ def test_a_chain_that_leaves_one_photo_out_is_refined_without_it():
 def test_a_chain_in_which_every_photo_hangs_on_the_next_proves_nothing():
     chain = matched(scene(8), noise_px=NOISE_PX, joined=lambda i, j: j == i + 1)
     assert len(chain.pairs) == 7
-    refused(perturbed(scene(8)), chain, "pairs that had no part in it fit to 1 px")
+    refused(perturbed(scene(8)), chain, "pairs that had no part in it fit to 0.5 px")
     assert refine(perturbed(scene(8)), matched(scene(8), noise_px=NOISE_PX, joined=lambda i, j: j <= i + 2)).accepted
 
 

@@ -81,7 +81,7 @@ class RefineSettings:
     proven: float = 0.5
     """More than this share of the held-out pairs must fit to `proven_px`. Where photos hang together in a chain, none
     of them can be held out without losing photos: such cameras are a guess, however well they fit."""
-    proven_px: float = 1.0
+    proven_px: float = 0.5
     """Median epipolar error, in matching pixels, of a held-out pair that fits."""
     seed: int = 0
     """Of the folds and draws."""
