@@ -127,7 +127,7 @@ def main() -> None:
             print(f"{views} views, {len(chosen)} rooms, {way:28s}", values)
     if arguments.out:
         settings = {name: str(value) for name, value in vars(arguments).items()}
-        write_result(arguments.out, settings=settings, results={"tables": results, "rooms": rows}, show=False)
+        write_result(arguments.out, settings=settings, results={"tables": results}, show=False)
 
 
 if __name__ == "__main__":
