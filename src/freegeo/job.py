@@ -310,11 +310,14 @@ class Job:
         if changed and predicted is not frozen and not (kept / PREDICTION_NAME).is_file():
             predicted.save(kept)
         if self.refine and self._is_refined(placed, frozen, is_frozen=predicted is frozen):
-            return Reconstruction.load(path), about
-        result, _ = self._in_metres(placed)
-        if changed or predicted is frozen or self._predicted_folder != path:
-            result.save(path)
-        remove_written(before)
+            result, unrefined = Reconstruction.load(path), placed is not frozen
+        else:
+            (result, _), unrefined = self._in_metres(placed), False
+            if changed or predicted is frozen or self._predicted_folder != path:
+                result.save(path)
+        # What earlier settings of this folder left must not count as steps on the way to this result.
+        if not unrefined:
+            remove_written(before)
         if not changed:
             remove_written(kept)
         return result, about

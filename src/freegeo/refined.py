@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from freegeo.evidence.bundle import pycolmap_module
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.guard import Reference
 from freegeo.evidence.refinement import Refinement, bring_depth, depth_misfit
-from freegeo.export.reconstruction import Reconstruction
+from freegeo.export.reconstruction import METRIC_MODEL, Reconstruction
 from freegeo.fusion.tracks import Tracks
 from freegeo.guarded import scene_matches
 from freegeo.models.precision import choose_device
@@ -25,6 +26,8 @@ from freegeo.types import PhotoLike, Priors
 
 if TYPE_CHECKING:
     from freegeo.data.photos import PhotoSource
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,6 +119,13 @@ def refine_by_photos(
         source, depth = _better_depth(prediction, found, again)
         result, _ = bring_depth(source, found)
         scores["after"] = reference.measure(Candidate.of(result, device)).as_dict() | (scores["after"] or {})
+        if prediction.scale is not None and prediction.scale.source != METRIC_MODEL:
+            logger.warning(
+                "Lengths were brought to metres from %s before the refinement, which moves surfaces and cameras, so "
+                "that they fit these metres no more exactly. Bring the refined result to metres instead: give --scale "
+                "together with --refine ba to `freegeo run` or `freegeo reconstruct`.",
+                prediction.scale.source,
+            )  # fmt: skip
     return Refined(
         result=result, tracks=found.tracks if found.accepted else None, about=_about(found, {**scores, **depth})
     )

@@ -1,11 +1,13 @@
 """`refine`: a result whose cameras fit the photos better, or a sentence and nothing."""
 
 import json
+import shutil
 import sys
 
 import numpy as np
 import pytest
 
+from cli.conftest import QUICK
 from evidence_tools import turned
 from freegeo.data.procedural import photograph_room
 from freegeo.evidence.candidate import Candidate
@@ -15,6 +17,7 @@ from freegeo.export.photos import photo_records
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import write_json
 from freegeo.lock import locked
+from freegeo.report.result import load_result
 
 VIEWS = 8
 
@@ -76,8 +79,6 @@ def test_photos_that_cannot_judge_leave_nothing(freegeo, photo_folder, tiny, tmp
 
 
 def test_photos_that_are_gone_are_missed(freegeo, result, tmp_path):
-    import shutil
-
     shutil.copytree(result / "out", tmp_path / "out")
     summary = json.loads((tmp_path / "out" / "reconstruction.json").read_text())
     for record in summary["photo_files"]:
@@ -158,6 +159,34 @@ def test_a_refused_refinement_leaves_the_result_and_says_why(freegeo, photo_fold
     for text in (outcome.out, outcome.err):
         assert told["reason"] in text
     assert not (tmp_path / "out/unrefined").exists() and not (tmp_path / "out/tracks.npz").exists()
+
+
+@pytest.mark.parametrize("adapts", [True, False])
+def test_steps_of_earlier_settings_do_not_stay_beside_a_refined_result(
+    freegeo, result, tiny, tmp_path, monkeypatch, adapts
+):
+    out = tmp_path / "out"
+    command = ["reconstruct", result / "photos", "-o", out, *tiny, "--formats", "npz", "--refine", "ba"]
+    if adapts:
+        # An adapter that cannot be used: the result is that of the frozen model.
+        monkeypatch.setattr("freegeo.job.not_finite", lambda result: "broken.")
+        command = ["run", *command[1:], *QUICK]
+    assert freegeo(*command, "--one-camera").code == 0
+    assert (out / "unrefined").exists() and (out / "predicted").exists() is not adapts
+    assert freegeo(*command).code == 0
+    assert not (out / "predicted").exists() and (out / "unrefined").exists() is not adapts
+    before = load_result(out).stages["frozen"].K[:, 0, 0]
+    assert np.ptp(before) > 0
+
+
+def test_metres_of_a_measured_distance_are_said_to_be_moved_by_refinement(freegeo, result, tmp_path):
+    shutil.copytree(result / "out", tmp_path / "out")
+    found = Reconstruction.load(tmp_path / "out")
+    found.scaled(2.0, source="a measured distance").save(tmp_path / "out")
+    outcome = freegeo("refine", tmp_path / "out", "-o", tmp_path / "refined", "--formats", "npz")
+    assert outcome.code == 0 and "metres from a measured distance" in outcome.err
+    warnings = json.loads((tmp_path / "refined/reconstruction.json").read_text())["warnings"]
+    assert any("metres from a measured distance" in sentence for sentence in warnings)
 
 
 @pytest.mark.parametrize("command", ["run", "reconstruct"])
