@@ -51,6 +51,11 @@ def test_an_adapter_that_helped_needs_no_advice():
     assert found.advice == ()
 
 
+def test_known_cameras_are_not_advised_to_be_refined():
+    known = summary(verdict=verdict("frozen"), rejected_adapter="Because.", known_cameras={"poses": 3})
+    assert "--refine" not in " ".join(answer(known).advice)
+
+
 def test_an_adapter_that_did_not_help_is_not_used():
     found = answer(summary(verdict=verdict("frozen"), rejected_adapter="Because."))
     assert found.parts[0].outcome == "no"

@@ -141,7 +141,8 @@ def _advice(summary: Mapping[str, Any], parts: list[Part]) -> Iterator[str]:
         yield LACKING[lacking]
     if adaptation == "unknown" and not verdict and summary.get("filters") is not None:
         yield "--guard select: let the matches decide whether the adapter is used."
-    if adaptation == "no" and "Refinement" not in outcomes and summary.get("filters") is not None:
+    could_refine = summary.get("filters") is not None and not summary.get("known_cameras")
+    if adaptation == "no" and "Refinement" not in outcomes and could_refine:
         yield "--refine ba: bring the cameras to the matches by bundle adjustment (pip install 'freegeo[colmap]')."
     if adaptation == "no" and verdict:
         recipe = summary["recipe"]
