@@ -238,6 +238,16 @@ def test_another_reference_view_keeps_the_adapter(freegeo, copy, photo_folder, t
     assert json.loads((copy / "reconstruction.json").read_text())["reference_view"] == "middle"
 
 
+def test_an_adapter_is_judged_again_by_predictions_of_another_reference_view(freegeo, photo_folder, tiny, tmp_path):
+    command = ("run", photo_folder, "-o", tmp_path / "out", *tiny, *QUICK[:-1], "report", "--formats", "npz")
+    assert freegeo(*command).code == 0
+    trained = (tmp_path / "out" / "adapter" / "freegeo.json").stat().st_mtime_ns
+    outcome = freegeo(*command, "--reference", "middle")
+    assert outcome.code == 2 and "the predictions that the guard judges by" in outcome.sentence()
+    assert freegeo(*command, "--reference", "middle", "--overwrite").code == 0
+    assert (tmp_path / "out" / "adapter" / "freegeo.json").stat().st_mtime_ns != trained
+
+
 def test_an_adapter_that_changes_nothing_gives_the_frozen_result(freegeo, photo_folder, weights, tmp_path, monkeypatch):
     from freegeo.models import da3_config
 

@@ -64,6 +64,7 @@ LABELS = {
         )
     },
     "pose_from": "--pose-from",
+    "judged_by": "the predictions that the guard judges by",
 }  # fmt: skip
 """What messages call the settings of an output folder."""
 FILES = {
@@ -164,15 +165,17 @@ def run_job(
         "adapter": None if adapter is None else adapter_identity(adapter),
         **({} if priors is None else {"known_cameras": priors.digest()}),
     }  # fmt: skip
+    # Only where it is not the default, so that folders of earlier versions count as finished.
+    rays = {} if pose_from == "camera" else {"pose_from": pose_from}
+    reference = model_options.reference or empty.spec.reference
+    judged = rays | ({} if reference == empty.spec.reference else {"reference": reference})
+    if plan is not None and guard != "off" and judged:
+        adaptation["judged_by"] = judged
     settings = {
         "command": command,
         **(extra_settings or {}),
         "adaptation": adaptation,
-        "prediction": {
-            "reference": model_options.reference or empty.spec.reference,
-            # Only where it is not the default, so that folders of earlier versions count as finished.
-            **({} if pose_from == "camera" else {"pose_from": pose_from}),
-        },
+        "prediction": {"reference": reference, **rays},
         **placing_settings(known, scale, one_camera=one_camera),
         "refinement": "ba" if refining else "off",
         "filters": files.filter_settings(masks),
