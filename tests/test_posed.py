@@ -436,7 +436,12 @@ def test_measured_points_bring_each_view_s_depth_to_the_known_cameras():
     measured = found.about["measured"]
     assert measured["views"] == 6 and measured["points"] > 30
     assert found.result.scale.value == pytest.approx(posed.result.scale.value * measured["factor"])
-    assert found.result.scale.spread == measured["spread"]
+    assert found.result.scale.spread == measured["spread"] > 0
+    # One view says nothing about how far views differ.
+    alone = before.depth_z.copy()
+    alone[1:] = np.nan
+    one = with_measured_depth(with_known_cameras(replace(before, depth_z=alone), known), known, matches)
+    assert one.about["measured"]["views"] == 1 and one.result.scale.spread is None
 
 
 def test_without_points_depth_keeps_the_scale_of_the_cameras_and_says_so(caplog):

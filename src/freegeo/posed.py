@@ -224,8 +224,8 @@ class Posed:
     about: Mapping[str, Any]
     """JSON-like: `source`, `poses` and `intrinsics` (how many are known), `metric`, `scale`, `spread`, `rotation_deg`,
     `position` (`Fit`), `focal` (median ratio of known to predicted focal lengths); None where there is none. With
-    `with_measured_depth` also `measured`: `points`, `views` with enough of them, `factor` and `spread` over the views;
-    None where too few were measured."""
+    `with_measured_depth` also `measured`: `points`, `views` with enough of them, `factor` and `spread` over the views
+    (None: one view); None where too few were measured."""
 
 
 def with_known_cameras(prediction: Reconstruction, known: KnownCameras) -> Posed:
@@ -294,7 +294,8 @@ def with_measured_depth(posed: Posed, known: KnownCameras, matches: Matches) -> 
         )
         return replace(posed, about={**posed.about, "measured": None})
     own = found.factors[found.own]
-    factor, spread = float(np.median(own)), NORMAL * float(np.median(np.abs(np.log(own / np.median(own)))))
+    factor = float(np.median(own))
+    spread = NORMAL * float(np.median(np.abs(np.log(own / factor)))) if len(own) > 1 else None
     scale = posed.result.scale
     if scale is not None:
         scale = replace(scale, value=scale.value * factor, spread=spread)
