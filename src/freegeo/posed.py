@@ -356,7 +356,7 @@ def _doubt_focal(focal: float, known: KnownCameras) -> None:
     if abs(focal - 1) > DOUBTFUL_FOCAL:
         logger.warning(
             "%s: the known focal lengths are %.2f times those that the model sees. The known ones are used, and depth "
-            "stays as predicted, so that shapes may be stretched along the view.",
+            "keeps its shape, so that surfaces may be stretched along the view.",
             known.source, focal,
         )  # fmt: skip
 

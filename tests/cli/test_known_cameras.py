@@ -11,6 +11,7 @@ from cli.conftest import PHOTOS, QUICK
 from freegeo.cameras.known import KnownCamera, KnownCameras
 from freegeo.cameras.plain import write
 from freegeo.data.procedural import render, sample_rooms
+from freegeo.errors import UserError
 from freegeo.export.pixels import corner_K
 from freegeo.export.reconstruction import Reconstruction
 
@@ -87,6 +88,23 @@ def test_other_cameras_are_another_run_where_the_model_is_told_them(freegeo, pho
     assert outcome.code == 0 and "poses and intrinsics of all photos, or none" in outcome.err
     np.testing.assert_allclose(Reconstruction.load(out).T_cam_world[1], known.cameras[1].T_cam_world, atol=1e-12)
     assert freegeo("refine", out, "-o", tmp_path / "refined").code == 2
+
+
+def test_refused_cameras_leave_a_result_that_is_there(freegeo, photo_folder, tiny, file, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    command = ["reconstruct", photo_folder, "-o", out, *tiny, *LITTLE]
+    assert freegeo(*command, "--cameras", file, "--trust-cameras").code == 0
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+    def refuse(*arguments, **options):
+        raise UserError("the cameras do not fit")
+
+    monkeypatch.setattr("freegeo.posed.check_known", refuse)
+    # Cameras that were trusted are not taken for checked ones.
+    outcome = freegeo(*command, "--cameras", file)
+    assert outcome.code == 2 and "the cameras do not fit" in outcome.sentence()
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert "already finished" in freegeo(*command, "--cameras", file, "--trust-cameras").out
 
 
 def test_shared_focal_lengths_and_back(freegeo, photo_folder, tiny, tmp_path):

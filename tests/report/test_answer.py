@@ -117,3 +117,8 @@ def test_a_refused_refinement_changes_nothing_and_says_what_it_lacks(lacking):
     assert found.parts[0].outcome == "no" and "stay as they were predicted" in found.parts[0].sentence
     assert rows(found) == ["frozen (used)", "refined, refused"][: 2 if after else 1]
     assert found.advice == (LACKING[lacking],)
+
+
+def test_with_known_cameras_the_scores_are_said_to_be_those_of_predicted_ones():
+    one = answer(summary(verdict=verdict("adapted", chosen=0), adapter="adapter", known_cameras={"poses": 4}))
+    assert one.parts[0].sentence == "Because. These are the cameras that the model sees; the result has the known ones."

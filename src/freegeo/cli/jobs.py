@@ -47,7 +47,7 @@ _OTHER_CONTENTS = "photos with other contents"
 LABELS = {
     "photos": "other photos", "photo_contents": _OTHER_CONTENTS, "contents": _OTHER_CONTENTS, "scenes": "other scenes",
     "checkpoint": "other weights", "weights": "another adapter", "folder": "--adapter", "masks": "other masks",
-    "known_cameras": "other known cameras",
+    "known_cameras": "other known cameras", "trusted_cameras": "--trust-cameras",
     "scale": "another --scale",
     "one_camera": "--one-camera",
     "command": "the command", "recipe": "--adapt", "name": "--recipe", "sets_per_scene": "--sets",
@@ -171,23 +171,31 @@ def run_job(
     judged = rays | ({} if reference == empty.spec.reference else {"reference": reference})
     if plan is not None and guard != "off" and judged:
         adaptation["judged_by"] = judged
+    placed = placing_settings(known, scale, one_camera=one_camera, trusted=cameras.trust_cameras)
     settings = {
         "command": command,
         **(extra_settings or {}),
         "adaptation": adaptation,
         "prediction": {"reference": reference, **rays},
-        **placing_settings(known, scale, one_camera=one_camera),
+        **placed,
         "refinement": "ba" if refining else "off",
         "filters": files.filter_settings(masks),
         "formats": formats,
     }
     options = {"overwrite": output.overwrite, "parts": PARTS, "labels": LABELS}
+    unchecked = known is not None and not cameras.trust_cameras
+    state = stored_state(output.output)
+    if known is not None and unchecked and state is not None and state["settings"].get("placing") != placed["placing"]:
+        # Before a result that is there gives way to one with cameras that may be refused.
+        console.note("known cameras against matches between the photos ...")
+        check_known(known, photos)
+        unchecked = False
     with run_folder(output.output, settings, **options) as folder, progress_hooks() as hooks:
         if folder.finished:
             say_finished(output.output, folder.finished_at)
             require_complete(output.output, read_json(folder / SUMMARY_NAME).get("not_written", {}))
             return
-        if known is not None and not cameras.trust_cameras:
+        if known is not None and unchecked:
             console.note("known cameras against matches between the photos ...")
             check_known(known, photos, folder / MATCHES_NAME)
         if any(isinstance(photo, VideoFrame | UndistortedPhoto) for photo in photos):
@@ -205,13 +213,16 @@ def run_job(
     require_complete(output.output, summary["not_written"])
 
 
-def placing_settings(known: KnownCameras | None, scale: ScaleSource | None, *, one_camera: bool) -> dict[str, Any]:
+def placing_settings(
+    known: KnownCameras | None, scale: ScaleSource | None, *, one_camera: bool, trusted: bool
+) -> dict[str, Any]:
     """Return the part of a job's settings about known and shared cameras, and scale; empty without any of them."""
     from freegeo.posed import digest
 
     values = {
         "known_cameras": None if known is None else digest(known), "one_camera": one_camera,
         "scale": None if scale is None else hashlib.sha256(repr(scale).encode()).hexdigest()[:16],
+        **({"trusted_cameras": True} if known is not None and trusted else {}),
     }  # fmt: skip
     return {"placing": values} if any(values.values()) else {}
 

@@ -66,7 +66,9 @@ def _adaptation(summary: Mapping[str, Any]) -> Iterator[Part]:
         yield Part(what="Adaptation", outcome="no", sentence=f"{rejected[0].upper()}{rejected[1:]}")
     elif verdict:
         outcomes: dict[str, Outcome] = {"adapted": "yes", "frozen": "no"}
-        yield Part(what="Adaptation", outcome=outcomes.get(verdict["outcome"], "unknown"), sentence=verdict["reason"])
+        known = " These are the cameras that the model sees; the result has the known ones."
+        sentence = verdict["reason"] + (known if summary.get("known_cameras") else "")
+        yield Part(what="Adaptation", outcome=outcomes.get(verdict["outcome"], "unknown"), sentence=sentence)
     else:
         why = "the model predicts no cameras" if summary.get("filters") is None else "--guard off"
         yield Part(
