@@ -317,6 +317,7 @@ def test_evidence_is_the_same_on_every_device(device):
         np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_training_on_a_gpu_renders_learns_and_saves_there(tmp_path):
     config = TrainConfig(
         views=8, views_per_step=2, rooms=3, rooms_per_shard=1, frames=3, depth_views=1, warmup_views=1, broken_steps=1,

@@ -677,6 +677,7 @@ adapting.adapt(model, [noise_scene(9), noise_scene(5, seed=1)], quick(model, ste
 """
 
 
+@pytest.mark.slow
 def test_a_killed_process_s_run_ends_with_the_same_tensors(tmp_path):
     def result(**options):
         model = tiny_da3()

@@ -79,6 +79,7 @@ def test_the_teacher_runs_once_per_distinct_view_set():
     assert passes(tiny_da3, 5, quick(tiny_da3(), epochs=2, sets_per_scene=4, distinct_seeds=4, batch=4)) == 1
 
 
+@pytest.mark.slow
 def test_a_sample_is_kept_from_its_first_visit_to_its_last():
     """Memory does not grow with epochs, and recipes that draw anew keep nothing."""
 

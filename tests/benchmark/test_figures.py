@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from PIL import Image
 
 from bench_tools import DATASET, ROOMS, store_truth, task
@@ -9,6 +10,7 @@ from freegeo.benchmark.score import evaluate_all
 from freegeo.data.datasets.registry import load_scene
 
 
+@pytest.mark.slow
 def test_a_benchmark_folder_gets_its_figures_in_both_formats(tmp_path, small_rooms, monkeypatch):
     monkeypatch.setattr(figures, "CLOUD_POINTS", 500)
     data, out = tmp_path / "data", tmp_path / "out"

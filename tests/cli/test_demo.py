@@ -61,6 +61,7 @@ def test_finished_demo_shows_its_table_again(freegeo, tiny, finished):
     assert "room: 0 there, 1 now" in other.sentence()
 
 
+@pytest.mark.slow
 def test_demo_that_was_stopped_while_scoring_is_not_finished(freegeo, tiny, tmp_path, monkeypatch):
     arguments = ["demo", "-o", tmp_path, "--checkpoint", tiny[3], *QUICK[:4]]
     with monkeypatch.context() as patch:

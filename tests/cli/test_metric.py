@@ -78,6 +78,7 @@ def test_scores_of_cameras_are_refused(freegeo, tmp_path):
         assert "tiny-single-view predicts no cameras" in outcome.sentence()
 
 
+@pytest.mark.slow
 def test_a_metric_model_gives_metres_frozen_and_adapted(freegeo, photo_folder, tmp_path):
     out = tmp_path / "out"
     outcome = freegeo("run", photo_folder, "-o", out, "--model", "tiny-nested", *OPTIONS, "--lr", "1e-6")

@@ -161,6 +161,7 @@ def test_a_refused_refinement_leaves_the_result_and_says_why(freegeo, photo_fold
     assert not (tmp_path / "out/unrefined").exists() and not (tmp_path / "out/tracks.npz").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adapts", [True, False])
 def test_steps_of_earlier_settings_do_not_stay_beside_a_refined_result(
     freegeo, result, tiny, tmp_path, monkeypatch, adapts

@@ -18,6 +18,7 @@ def small_run(monkeypatch):
     monkeypatch.setattr(loop, "EVALUATION_ROOMS", 2)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small_run")
 def test_training_leaves_weights_and_a_learning_curve_and_goes_on(freegeo, tmp_path):
     run = tmp_path / "run"
