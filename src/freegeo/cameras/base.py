@@ -16,7 +16,16 @@ from freegeo.errors import UserError
 if TYPE_CHECKING:
     from freegeo.cameras.known import KnownCameras
 
-__all__ = ["CameraFile", "FileCamera", "Format", "matrix_of_numbers", "read_json_object", "read_text"]
+__all__ = [
+    "CameraFile",
+    "FileCamera",
+    "Format",
+    "find_frames",
+    "matrix_of_numbers",
+    "read_frames",
+    "read_json_object",
+    "read_text",
+]
 
 BelongBy = Literal["name", "time", "order"]
 """How the cameras of a file find their photos."""
@@ -94,6 +103,17 @@ def matrix_of_numbers(values: Any, shapes: Sequence[tuple[int, int]], what: str)
     return matrix
 
 
+def find_frames(path: Path, name: str, is_own: Callable[[Any], bool]) -> Path | None:
+    """Return a JSON file, or the one called `name` in a folder, when its `frames` are those of a format; else None."""
+    file = path / name if path.is_dir() else path
+    if file.suffix.lower() != ".json" or not file.is_file():
+        return None
+    try:
+        return file if is_own(json.loads(file.read_text(encoding="utf-8-sig"))["frames"]) else None
+    except (ValueError, KeyError, TypeError, OSError):
+        return None
+
+
 def read_json_object(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file; UserError when it is broken, or something else."""
     try:
@@ -103,3 +123,12 @@ def read_json_object(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise UserError(f"{path}: holds no JSON object.")
     return content
+
+
+def read_frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the object in a JSON file and its list of frames; UserError when it is broken, or has none."""
+    content = read_json_object(path)
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise UserError(f"{path}: has no list of frames.")
+    return content, frames

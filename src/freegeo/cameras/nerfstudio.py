@@ -6,7 +6,6 @@ the poses were written; they belong to the world afterwards, and so do results: 
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from freegeo import files
-from freegeo.cameras.base import CameraFile, FileCamera, Format, matrix_of_numbers, read_json_object
+from freegeo.cameras.base import CameraFile, FileCamera, Format, find_frames, matrix_of_numbers, read_frames
 from freegeo.cameras.convention import matrix_of
 from freegeo.cameras.known import KnownCameras, Lens
 from freegeo.errors import UserError
@@ -32,22 +31,12 @@ FISHEYE = "OPENCV_FISHEYE"
 
 def find(path: Path) -> Path | None:
     """Return the JSON file when its frames have a `transform_matrix`."""
-    file = path / "transforms.json" if path.is_dir() else path
-    if file.suffix.lower() != ".json" or not file.is_file():
-        return None
-    try:
-        frames = json.loads(file.read_text(encoding="utf-8-sig"))["frames"]
-        return file if any("transform_matrix" in frame for frame in frames) else None
-    except (ValueError, KeyError, TypeError, OSError):
-        return None
+    return find_frames(path, "transforms.json", lambda frames: any("transform_matrix" in frame for frame in frames))
 
 
 def read(path: Path) -> CameraFile:
     """Read the frames; UserError for what is not of this format."""
-    content = read_json_object(path)
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise UserError(f"{path}: has no list of frames.")
+    content, frames = read_frames(path)
     if content.get("applied_transform") is not None:
         logger.info("%s: its world is the one after applied_transform, which is not undone", path)
     if content.get("applied_scale", 1.0) != 1.0:

@@ -9,13 +9,12 @@ docs/cameras.md, "cameras.json" has the table of the keys.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from freegeo import files
-from freegeo.cameras.base import CameraFile, FileCamera, Format, matrix_of_numbers, read_json_object
+from freegeo.cameras.base import CameraFile, FileCamera, Format, find_frames, matrix_of_numbers, read_frames
 from freegeo.cameras.known import KnownCamera, KnownCameras, Lens
 from freegeo.errors import UserError
 
@@ -25,22 +24,12 @@ _KEYS = frozenset({"name", "width", "height", "K", "w2c", "lens", "image_id", "c
 
 def find(path: Path) -> Path | None:
     """Return the JSON file when its frames have names."""
-    file = path / "cameras.json" if path.is_dir() else path
-    if file.suffix.lower() != ".json" or not file.is_file():
-        return None
-    try:
-        frames = json.loads(file.read_text(encoding="utf-8-sig"))["frames"]
-        return file if frames and all("name" in frame for frame in frames) else None
-    except (ValueError, KeyError, TypeError, OSError):
-        return None
+    return find_frames(path, NAME, lambda frames: bool(frames) and all("name" in frame for frame in frames))
 
 
 def read(path: Path) -> CameraFile:
     """Read the frames; UserError for what is not of this format."""
-    content = read_json_object(path)
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise UserError(f"{path}: has no list of frames.")
+    content, frames = read_frames(path)
     metric = content.get("metric", False)
     if not isinstance(metric, bool):
         raise UserError(f"{path}: metric is {metric!r}; it must be true or false.")
