@@ -43,6 +43,16 @@ from freegeo.metres import ScaleSource, in_metres
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
 from freegeo.models.spec import ModelSpec, PoseFrom
+from freegeo.pipeline import (
+    CPU,
+    capital,
+    judge_by_photos,
+    not_finite,
+    other_use,
+    predict,
+    predict_unchecked,
+    with_targets,
+)
 from freegeo.posed import (
     doubt_focal_length,
     is_measurable,
@@ -59,17 +69,6 @@ from freegeo.types import ImageBatch, PhotoLike, Priors
 if TYPE_CHECKING:
     from freegeo.cameras.known import KnownCameras
     from freegeo.fusion.tracks import Tracks
-
-from freegeo.pipeline import (
-    CPU,
-    capital,
-    judge_by_photos,
-    not_finite,
-    other_use,
-    predict,
-    predict_unchecked,
-    with_targets,
-)
 
 logger = logging.getLogger(__name__)
 
@@ -204,6 +203,13 @@ class Job:
         self.folder.finish()
         return summary
 
+    @property
+    def _asked(self) -> dict[str, Any]:
+        """How the frozen and the adapted model are asked: arguments of `predict`."""
+        return {
+            "reference": self.reference, "priors": self.priors, "pose_from": self.pose_from, "compute": self.compute,
+        }  # fmt: skip
+
     def _predicted(self, folder: Path, stage: str) -> Reconstruction:
         """Predict with the frozen model, or with `adapter`, or read what is there already."""
         if (folder / PREDICTION_NAME).is_file():
@@ -211,14 +217,7 @@ class Job:
         if self.adapter is not None:
             assert self.in_place is not None
         with self._timed(stage):
-            result = predict(
-                self.model,
-                self.batch,
-                reference=self.reference,
-                priors=self.priors,
-                pose_from=self.pose_from,
-                compute=self.compute,
-            )
+            result = predict(self.model, self.batch, **self._asked)
             result.save(folder)
         return result
 
@@ -238,10 +237,9 @@ class Job:
                 if recipe.cameras:
                     assert self.photos is not None
                     self.hooks.stage("cameras to learn from")
-                    images, _, judging = with_targets(
-                        self.model, images, [(self.photos, self.batch)], seed=self.seed, compute=self.compute,
-                        frozen=[frozen], stores=stores,
-                    )  # fmt: skip
+                    images, judging = with_targets(
+                        images, [self.photos], [frozen], seed=self.seed, compute=self.compute, stores=stores
+                    )
                 self.hooks.stage("adaptation")
                 result = train_adapter(
                     self.model, images, recipe, seed=self.seed, compute=self.compute,
@@ -277,14 +275,7 @@ class Job:
             return (Reconstruction.load(self._predicted_folder), None) if rejected is None else (frozen, rejected)
         assert self.in_place is not None
         with self._timed("adapted prediction"):
-            result = predict_unchecked(
-                self.model,
-                self.batch,
-                reference=self.reference,
-                priors=self.priors,
-                pose_from=self.pose_from,
-                compute=self.compute,
-            )
+            result = predict_unchecked(self.model, self.batch, **self._asked)
             rejected = not_finite(result)
             if rejected is None:
                 result.save(path)

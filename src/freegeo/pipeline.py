@@ -400,57 +400,49 @@ def before_training(
         The scenes, with targets where the recipe learns from cameras; the frozen predictions, unless the guard is off;
         the matches that are left to judge by, where others teach.
     """
-    if plan.cameras:
-        return with_targets(model, images, scenes, seed=seed, compute=compute)
-    if guard == "off":
+    if guard == "off" and not plan.cameras:
         return images, None, None
     frozen = [
         predict(model, batch, priors=one.priors, compute=compute)
         for one, (_, batch) in zip(images, scenes, strict=True)
     ]
-    return images, frozen, None
+    if not plan.cameras:
+        return images, frozen, None
+    taught, judging = with_targets(images, [photos for photos, _ in scenes], frozen, seed=seed, compute=compute)
+    return taught, frozen, judging
 
 
 def with_targets(
-    model: ReconstructionModel,
     images: Sequence[SceneImages],
-    scenes: Sequence[tuple[Sequence[PhotoLike], ImageBatch]],
+    photos: Sequence[Sequence[PhotoLike]],
+    frozen: Sequence[Reconstruction],
     *,
     seed: int,
     compute: Compute,
-    reference: str | None = None,
-    frozen: Sequence[Reconstruction] | None = None,
     stores: Sequence[Path | None] | None = None,
-) -> tuple[list[SceneImages], list[Reconstruction], list[Matches]]:
+) -> tuple[list[SceneImages], list[Matches]]:
     """Give scenes the cameras that their photos prove, for a recipe that learns from them.
 
     Args:
-        model: without an adapter.
         images: of the scenes.
-        scenes: their photos, and the same as images for the model.
+        photos: of each scene.
+        frozen: predictions of these photos.
         seed: decides which pairs of photos teach.
-        compute: where predictions are made.
-        reference: rule of the reference view.
-        frozen: predictions; None: they are made here.
+        compute: where depth maps are compared.
         stores: files for the matches of the scenes; None: they are not stored.
 
     Returns:
-        The scenes with targets, the frozen predictions, and the matches that are left to judge by.
+        The scenes with targets, and the matches that are left to judge by.
 
     Raises:
         NoEvidenceError: the matches of a scene prove no cameras.
     """
-    if frozen is None:
-        frozen = [
-            predict(model, batch, reference=reference, priors=one.priors, compute=compute)
-            for one, (_, batch) in zip(images, scenes, strict=True)
-        ]
     lessons = [
-        lesson(one.name, photos, before, store, seed=seed, device=str(compute.device))
-        for one, (photos, _), before, store in zip(images, scenes, frozen, stores or [None] * len(scenes), strict=True)
+        lesson(one.name, seen, before, store, seed=seed, device=str(compute.device))
+        for one, seen, before, store in zip(images, photos, frozen, stores or [None] * len(images), strict=True)
     ]
     taught = [replace(one, targets=found.targets) for one, found in zip(images, lessons, strict=True)]
-    return taught, list(frozen), [found.judging for found in lessons]
+    return taught, [found.judging for found in lessons]
 
 
 def judge_by_photos(
