@@ -17,7 +17,7 @@ import torch
 
 from freegeo import __version__
 from freegeo.adaptation import adapter_files
-from freegeo.adaptation.adapt import Progress, loss_change
+from freegeo.adaptation.adapt import Adapted, Progress, loss_change
 from freegeo.adaptation.adapt import adapt as train_adapter
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.adapter_files import ADAPTER_FOLDER, METADATA
@@ -68,6 +68,7 @@ from freegeo.types import ImageBatch, PhotoLike, Priors
 
 if TYPE_CHECKING:
     from freegeo.cameras.known import KnownCameras
+    from freegeo.evidence.matches import Matches
     from freegeo.fusion.tracks import Tracks
 
 logger = logging.getLogger(__name__)
@@ -104,6 +105,29 @@ class Hooks:
 
     stage: Callable[[str], None] = lambda name: None
     step: Callable[[Progress], None] = lambda progress: None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adaptation:
+    """What came of adapting the model to the photos."""
+
+    used: bool = False
+    """Whether the result is that of the adapted model."""
+    rejected: str | None = None
+    """Why the adapter could not be used."""
+    verdict: Mapping[str, Any] | None = None
+    """Of the guard on the adapter."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Computed:
+    """What a job made with the model."""
+
+    result: Reconstruction
+    """As it is in the folder."""
+    about: Mapping[str, Any]
+    """Facts for reconstruction.json: `known_cameras` and `one_camera`."""
+    adaptation: Adaptation = Adaptation()
 
 
 @dataclass
@@ -179,29 +203,40 @@ class Job:
 
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
-        frozen, rejected, verdict = None, None, None
-        if self.recipe is None:
-            final = self._predicted(self.folder.path, "adapted prediction" if self.adapter else "prediction")
-        else:
-            frozen = self._predicted(self.folder / FROZEN_FOLDER, "frozen prediction")
-            rejected, verdict = self._trained(self.recipe, frozen)
-            final = frozen
-            if rejected is None and not (verdict and self.guard == "select" and verdict["outcome"] != "adapted"):
-                final, rejected = self._adapted_prediction(frozen)
-        if rejected is not None:
-            self._warn(f"{capital(rejected)} The result is that of the frozen model.")
-        trained = self.recipe is not None and final is not frozen
-        final, about = self._result(final, frozen)
+        found = self.make()
         if self.photos is not None:
-            doubt_focal_length(final, self.photos)
-        report, failed = self._export(final)
-        summary = self._summary(final, report, rejected, verdict, failed, about, trained=trained)
+            doubt_focal_length(found.result, self.photos)
+        report, failed = self._export(found.result)
+        summary = self._summary(found, report, failed, self.photos)
         write_json(self.folder / SUMMARY_NAME, summary)
         self.after(self)
         self.hooks.stage("report")
         write_report(self.folder.path, photos=self.photos)
         self.folder.finish()
         return summary
+
+    def make(self) -> Computed:
+        """Write all that needs the model and the photos, and return the result."""
+        frozen, rejected, verdict = None, None, None
+        if self.recipe is None:
+            final = self._predicted(self.folder.path, "adapted prediction" if self.adapter else "prediction")
+        else:
+            frozen = self.frozen()
+            rejected, verdict = self._trained(self.recipe, frozen)
+            final = frozen
+            if rejected is None and not (verdict and self.guard == "select" and verdict["outcome"] != "adapted"):
+                final, rejected = self._adapted_prediction(frozen)
+        if rejected is not None:
+            self._warn(f"{capital(rejected)} The result is that of the frozen model.")
+        result, about = self._result(final, frozen)
+        used = self.recipe is not None and final is not frozen
+        return Computed(
+            result=result, about=about, adaptation=Adaptation(used=used, rejected=rejected, verdict=verdict)
+        )
+
+    def frozen(self) -> Reconstruction:
+        """Predict with the frozen model before an adaptation, or read what is there already."""
+        return self._predicted(self.folder / FROZEN_FOLDER, "frozen prediction")
 
     @property
     def _asked(self) -> dict[str, Any]:
@@ -221,7 +256,7 @@ class Job:
             result.save(folder)
         return result
 
-    def _trained(self, recipe: Recipe, frozen: Reconstruction) -> tuple[str | None, dict[str, Any] | None]:
+    def _trained(self, recipe: Recipe, frozen: Reconstruction | None) -> tuple[str | None, dict[str, Any] | None]:
         """Train the adapter, or continue training it, unless it is finished, and let the guard judge it.
 
         Returns why it cannot be used, and the verdict; both may be None.
@@ -232,14 +267,15 @@ class Job:
             return noted["failed"], None
         if not (folder / METADATA).is_file():
             assert self.scene is not None
-            images, judging, stores = [self.scene(self.model)], None, [self.folder / MATCHES_NAME]
+            images, judging = [self.scene(self.model)], None
             try:
                 if recipe.cameras:
-                    assert self.photos is not None
+                    assert self.photos is not None and frozen is not None
                     self.hooks.stage("cameras to learn from")
                     images, judging = with_targets(
-                        images, [self.photos], [frozen], seed=self.seed, compute=self.compute, stores=stores
-                    )
+                        images, [self.photos], [frozen], seed=self.seed, compute=self.compute,
+                        stores=[self.folder / MATCHES_NAME],
+                    )  # fmt: skip
                 self.hooks.stage("adaptation")
                 result = train_adapter(
                     self.model, images, recipe, seed=self.seed, compute=self.compute,
@@ -256,16 +292,21 @@ class Job:
                     "evidence of the photos" if self.guard != "off" else "comparison with the frozen model"
                 )
                 started = time.monotonic()
-                judge_by_photos(
-                    self.model, result, [(self.photos, self.batch)], compute=self.compute, guard=self.guard,
-                    reference=self.reference, frozen=[frozen], stores=stores, judging=judging, priors=[self.priors],
-                    pose_from=self.pose_from,
-                )  # fmt: skip
+                self._judge(result, frozen, judging)
                 seconds["evidence"] = round(time.monotonic() - started, 2)
             result.save(folder)
             self.folder.note("adaptation", {"seconds": seconds})
         metadata = read_json(folder / METADATA)
         return metadata.get("trouble"), metadata.get("verdict")
+
+    def _judge(self, result: Adapted, frozen: Reconstruction | None, judging: list[Matches] | None) -> None:
+        """Let the guard judge a finished adapter, and keep its verdict in the result."""
+        assert self.photos is not None and frozen is not None
+        judge_by_photos(
+            self.model, result, [(self.photos, self.batch)], compute=self.compute, guard=self.guard,
+            reference=self.reference, frozen=[frozen], stores=[self.folder / MATCHES_NAME], judging=judging,
+            priors=[self.priors], pose_from=self.pose_from,
+        )  # fmt: skip
 
     def _adapted_prediction(self, frozen: Reconstruction) -> tuple[Reconstruction, str | None]:
         """Predict with the trained adapter; the frozen prediction and the reason when that gives no usable numbers."""
@@ -390,31 +431,29 @@ class Job:
 
     def _summary(
         self,
-        final: Reconstruction,
+        found: Computed,
         report: FilterReport | None,
-        rejected: str | None,
-        verdict: Mapping[str, Any] | None,
         failed: Mapping[str, str],
-        about: Mapping[str, Any],
-        *,
-        trained: bool,
+        photos: Sequence[PhotoLike] | None,
+        **more: Any,
     ) -> dict[str, Any]:
+        final, adaptation = found.result, found.adaptation
+        why_not = adaptation.rejected or (adaptation.verdict or {}).get("reason")
         settings = dict(self.folder.settings)
-        seconds = {name: value for part in self.folder.notes.values() for name, value in part["seconds"].items()}
         return {
             "format": FORMAT,
             "model": self.spec.name,
             "checkpoint": self.checkpoint,
             "licence_of_weights": self.spec.weights_licence,
             "images": list(final.names),
-            "photo_files": None if self.photos is None else photo_records(self.photos),
+            "photo_files": None if photos is None else photo_records(photos),
             "image_hw": list(final.image_hw),
             "scale": None if final.scale is None else asdict(final.scale),
-            "adapter": ADAPTER_FOLDER if trained else (str(self.adapter) if self.adapter else None),
-            "rejected_adapter": None if trained or self.recipe is None else rejected or (verdict or {}).get("reason"),
-            "verdict": verdict,
-            "refinement": {k: v for k, v in self._noted("refinement").items() if k != "seconds"} or None,
-            **about,
+            "adapter": ADAPTER_FOLDER if adaptation.used else (str(self.adapter) if self.adapter else None),
+            "rejected_adapter": None if adaptation.used or self.recipe is None else why_not,
+            "verdict": adaptation.verdict,
+            "refinement": self._refinement(),
+            **found.about,
             "frozen_prediction": None if self.recipe is None else f"{FROZEN_FOLDER}/{PREDICTION_NAME}",
             "reference_view": "first" if self.priors is not None else self.reference or self.spec.reference,
             "pose_from": self.pose_from if self.spec.cameras else None,
@@ -425,12 +464,21 @@ class Job:
             "recipe": None if self.recipe is None else as_json(asdict(self.recipe)),
             "settings": settings,
             "command": self.command,
-            "seconds": seconds,
+            "seconds": self._seconds(),
             "versions": versions(),
+            **more,
         }
 
+    def _refinement(self) -> dict[str, Any] | None:
+        """Return what refinement made of the prediction; None where it was not asked for."""
+        return {k: v for k, v in self._noted("refinement").items() if k != "seconds"} or None
+
+    def _seconds(self) -> dict[str, float]:
+        """Return how long each stage took."""
+        return {name: value for part in self.folder.notes.values() for name, value in part["seconds"].items()}
+
     def _noted(self, part: str) -> dict[str, Any]:
-        return self.folder.notes.get(part) or {"seconds": {}}
+        return {"seconds": {}, **(self.folder.notes.get(part) or {})}
 
     def _loss_change(self) -> dict[str, float] | None:
         """Return the mean total loss of the first and last tenth of the steps."""

@@ -72,6 +72,12 @@ class Gps:
     views: tuple[int, ...]
     positions: tuple[tuple[float, float, float], ...]
 
+    def select(self, views: Sequence[int]) -> Gps:
+        """Return what is known of the chosen views, in the order given."""
+        known = dict(zip(self.views, self.positions, strict=True))
+        found = [(new, known[old]) for new, old in enumerate(views) if old in known]
+        return Gps(views=tuple(new for new, _ in found), positions=tuple(place for _, place in found))
+
 
 ScaleSource = Distances | Gps
 

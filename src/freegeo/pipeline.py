@@ -94,6 +94,7 @@ def predict_unchecked(
     """Predict as `predict`, and return values that are not finite too (`not_finite`)."""
     require_reference(reference, priors)
     plan_reconstruction(model, len(batch), batch.image_hw, compute=compute)
+    batch = batch.read()
     model.to(compute.device).eval()
     with compute.autocast():
         tokens = embed_in_chunks(model, batch.images, device=compute.device)

@@ -74,6 +74,14 @@ class RunFolder:
         """Return the path of a file in the folder."""
         return self.path / name
 
+    def sub(self, name: str) -> SubFolder:
+        """Return a folder in this one, such as that of a part of a result."""
+        notes = {part: value[name] for part, value in self.notes.items() if value and name in value}
+        return SubFolder(
+            path=self.path / name, lock=self.lock, settings=self.settings, finished_at=self.finished_at, notes=notes,
+            whole=self, name=name,
+        )  # fmt: skip
+
     def note(self, part: str, value: Any) -> None:
         """Keep a JSON-like value for processes that continue this run, until the part of the settings changes."""
         self.notes[part] = value
@@ -92,6 +100,20 @@ class RunFolder:
         if not (self.path / RUN_FILE).is_file():
             raise lost(self.path, f"the state of the run ({RUN_FILE}) was removed")
         write_json(self.path / RUN_FILE, _state(self.settings, finished, self.notes))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubFolder(RunFolder):
+    """A folder in a command's output folder, with notes of its own among those of the whole."""
+
+    whole: RunFolder
+    name: str
+    """Path below the output folder."""
+
+    def note(self, part: str, value: Any) -> None:
+        """Keep a JSON-like value as `RunFolder.note` does."""
+        self.notes[part] = value
+        self.whole.note(part, {**(self.whole.notes.get(part) or {}), self.name: value})
 
 
 @contextmanager

@@ -79,6 +79,10 @@ class ImageBatch:
         tensors = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "names"}
         return replace(self, names=tuple(self.names[i] for i in views), **tensors)
 
+    def read(self) -> ImageBatch:
+        """Return the batch with its pixels; `freegeo.models.images.Frames` reads them here."""
+        return self
+
     def digest(self) -> str:
         """Return a fingerprint of the pixels, which tells photos of the same names apart."""
         return hashlib.sha256(self.images.contiguous().numpy().tobytes()).hexdigest()[:16]

@@ -77,7 +77,7 @@ class SceneImages:
         """Use images that are already at the model's size."""
         inside = batch.inside()
         return cls(
-            name=name, count=len(batch), load=lambda frames: batch.images[list(frames)],
+            name=name, count=len(batch), load=lambda frames: batch.select(frames).read().images,
             inside=None if inside.all() else inside,
         )  # fmt: skip
 

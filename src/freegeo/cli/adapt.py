@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,6 +55,7 @@ def adapt(
         off.
     """
     from freegeo.adaptation.adapt import require_unchanged_images
+    from freegeo.data.photos import MAX_VIEWS
     from freegeo.errors import UserError
     from freegeo.models.images import read_photos
     from freegeo.pipeline import require_enough_photos, scene_images
@@ -65,6 +66,7 @@ def adapt(
     empty = model.build_empty()
     empty.adaptable()
     plan = recipe.build(empty.spec)
+    photos = replace(photos, max_views=MAX_VIEWS if photos.max_views is None else photos.max_views)
     scenes = {str(part[0]): load_source(part, photos) for part in split_scenes(sources)}
     check_inputs(output, [photo for found in scenes.values() for photo in found], cameras.cameras)
     model.warn_of_embedded(sources)

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -112,9 +112,16 @@ class FileOptions:
         return self.filters.load_masks([photo.name for photo in photos], [photo.size_hw for photo in photos])
 
 
-def require_complete(folder: Path, failed: Mapping[str, str]) -> None:
-    """Raise PartialResultError when formats could not be written."""
+def require_complete(folder: Path, failed: Mapping[str, str], sequence: Mapping[str, Any] | None = None) -> None:
+    """Raise PartialResultError when formats could not be written, or photos are not all in one piece."""
     if failed:
         raise PartialResultError(
             f"{folder}: {', '.join(failed)} not written, everything else is there. The warnings say why."
         )
+    if sequence is not None:
+        pieces, missing = sequence["pieces"], sequence["frames"] - sum(part["frames"] for part in sequence["pieces"])
+        if len(pieces) > 1 or missing:
+            raise PartialResultError(
+                f"{folder}: {pieces[0]['frames']} of {sequence['frames']} photos are in the result. The warnings say "
+                "where the others are, and why."
+            )

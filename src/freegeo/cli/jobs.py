@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from freegeo.cli.options import (
     PlacingOptions,
     RecipeOptions,
     Refine,
+    SequenceOptions,
     refines_with,
 )
 from freegeo.errors import UserError
@@ -34,6 +36,7 @@ from freegeo.progress import step_bar
 from freegeo.run_folder import check_folder, run_folder, stored_state
 
 if TYPE_CHECKING:
+    from freegeo.adaptation.recipe import Recipe
     from freegeo.cameras.known import KnownCameras
     from freegeo.job import Hooks, Job
     from freegeo.metres import ScaleSource
@@ -42,7 +45,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 DEFAULT_FILES = FileOptions()
-NO_CAMERAS, DEFAULT_PLACING = CameraOptions(), PlacingOptions()
+NO_CAMERAS, DEFAULT_PLACING, DEFAULT_SEQUENCE = CameraOptions(), PlacingOptions(), SequenceOptions()
 _OTHER_CONTENTS = "photos with other contents"
 LABELS = {
     "photos": "other photos", "photo_contents": _OTHER_CONTENTS, "contents": _OTHER_CONTENTS, "scenes": "other scenes",
@@ -64,6 +67,7 @@ LABELS = {
         )
     },
     "pose_from": "--pose-from",
+    "chunk": "--chunk", "overlap": "--overlap", "order": "--order", "loops": "--loops",
     "judged_by": "the predictions that the guard judges by",
 }  # fmt: skip
 """What messages call the settings of an output folder."""
@@ -77,6 +81,8 @@ FILES = {
     KEPT_NAME: "which pixels the filters kept as points",
     "adapter": "the adapter (peft format)",
     **{format.path: format.about for format in FORMATS.values()},
+    "chunks": "predictions of the chunks; they may be removed when the result is finished",
+    "pieces": "parts of the photos that could not be joined to the result",
     COPIES_FOLDER: "upright copies of the photos (undistorted ones), or the frames of the video that were used",
     "reconstruction.json": "settings, timings, versions, licence of the weights",
 }
@@ -106,6 +112,7 @@ def run_job(
     pose_from: PoseFrom = "camera",
     cameras: CameraOptions = NO_CAMERAS,
     placing: PlacingOptions = DEFAULT_PLACING,
+    sequence: SequenceOptions = DEFAULT_SEQUENCE,
     extra_settings: dict[str, Any] | None = None,
     after: Callable[[Job], None] = lambda job: None,
 ) -> None:
@@ -120,9 +127,10 @@ def run_job(
     from freegeo.data.video import VideoFrame
     from freegeo.job import MATCHES_NAME, PARTS, SUMMARY_NAME, Job
     from freegeo.metres import read_scale
-    from freegeo.models.images import read_photos
+    from freegeo.models.images import look_at_photos, read_photos
     from freegeo.pipeline import require_enough_photos, require_pose_from, require_reference, scene_images
     from freegeo.posed import check_known, is_one_camera, require_cameras, told, undistorted_masks
+    from freegeo.sequence_job import SEQUENCE_PARTS, SequenceJob
 
     check_place(output)
     check_inputs(output, photos, adapter, cameras.cameras)
@@ -151,14 +159,19 @@ def run_job(
     masks = undistorted_masks(masks, photos)
     scale = None if placing.scale is None else read_scale(placing.scale, photos)
     one_camera = is_one_camera(photos) if placing.one_camera is None else placing.one_camera
-    batch = read_photos(empty, photos, mixed=mixed)
+    pieces = sequence.plan(empty, photos, mixed, model_options.compute())
+    if pieces is None:
+        batch = read_photos(empty, photos, mixed=mixed)
+    else:
+        _require_joinable(known, plan)
+        batch = look_at_photos(empty, photos, mixed=mixed)
     priors, sentence = told(known, batch, empty.spec)
     if sentence:
         console.note(sentence)
     require_reference(model_options.reference, priors)
     if plan is not None and priors is not None:
         require_unchanged_images(plan)
-    adaptation = {
+    adaptation: dict[str, Any] = {
         "photos": list(batch.names), "photo_contents": batch.digest(), **model_options.identity(plan),
         "recipe": None if plan is None else asdict(plan),
         "guard": None if plan is None else guard,
@@ -171,6 +184,8 @@ def run_job(
     judged = rays | ({} if reference == empty.spec.reference else {"reference": reference})
     if plan is not None and guard != "off" and judged:
         adaptation["judged_by"] = judged
+    if pieces is not None:
+        adaptation["sequence"] = {"chunk": pieces.size, "overlap": pieces.overlap, "order": pieces.order}
     placed = placing_settings(known, scale, one_camera=one_camera, trusted=cameras.trust_cameras)
     settings = {
         "command": command,
@@ -179,10 +194,13 @@ def run_job(
         "prediction": {"reference": reference, **rays},
         **placed,
         "refinement": "ba" if refining else "off",
+        **({} if pieces is None else {"joining": {"loops": pieces.loops}}),
         "filters": files.filter_settings(masks),
         "formats": formats,
     }
-    options = {"overwrite": output.overwrite, "parts": PARTS, "labels": LABELS}
+    options = {
+        "overwrite": output.overwrite, "parts": PARTS if pieces is None else SEQUENCE_PARTS, "labels": LABELS,
+    }  # fmt: skip
     unchecked = known is not None and not cameras.trust_cameras
     state = stored_state(output.output)
     if known is not None and unchecked and state is not None and state["settings"].get("placing") != placed["placing"]:
@@ -193,14 +211,16 @@ def run_job(
     with run_folder(output.output, settings, **options) as folder, progress_hooks() as hooks:
         if folder.finished:
             say_finished(output.output, folder.finished_at)
-            require_complete(output.output, read_json(folder / SUMMARY_NAME).get("not_written", {}))
+            before = read_json(folder / SUMMARY_NAME)
+            require_complete(output.output, before.get("not_written", {}), before.get("sequence"))
             return
         if known is not None and unchecked:
             console.note("known cameras against matches between the photos ...")
             check_known(known, photos, folder / MATCHES_NAME)
         if any(isinstance(photo, VideoFrame | UndistortedPhoto) for photo in photos):
             write_copies(photos, folder / COPIES_FOLDER)
-        job = Job(
+        kind = Job if pieces is None else partial(SequenceJob, plan=pieces)
+        job = kind(
             load=model_options.load, spec=empty.spec, batch=batch, folder=folder, recipe=plan, adapter=adapter,
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), warnings=console.warned(), after=after, formats=formats, photos=photos,
@@ -210,7 +230,21 @@ def run_job(
         )  # fmt: skip
         summary = job.run()
         describe(summary, output.output)
-    require_complete(output.output, summary["not_written"])
+    require_complete(output.output, summary["not_written"], summary.get("sequence"))
+
+
+def _require_joinable(known: KnownCameras | None, plan: Recipe | None) -> None:
+    """Raise UserError for what photos that are predicted in chunks cannot have."""
+    if known is not None and known.has_pose.any() and not known.has_pose.all():
+        raise UserError(
+            f"{known.source}: of some photos the pose is known and of others not, and these are more photos than are "
+            "predicted at once. Give the poses of all photos, or of none, or only the photos whose poses are known."
+        )
+    if plan is not None and plan.cameras:
+        raise UserError(
+            f"recipe {plan.name} learns from cameras of one chunk, and these are more photos than are predicted at "
+            "once. Take recipe scene, or --max-views."
+        )
 
 
 def placing_settings(

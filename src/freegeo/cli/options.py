@@ -15,11 +15,12 @@ from cyclopts import Parameter
 from freegeo.adaptation.recipe import PAPER, SEED, DatasetName, Recipe, RecipeName, named, require_seed
 from freegeo.cli import console
 from freegeo.cli.sources import DEMO
-from freegeo.data.photos import MAX_VIEWS
 from freegeo.errors import UserError
 from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL, entry, warn_of_embedded_model
 from freegeo.models.spec import MIXED, Mixed
 
+OrderRule = Literal["auto", "given", "similar"]
+"""Order of photos that are predicted in chunks (docs/sequences.md, "Order")."""
 Refine = Literal["auto", "ba", "off"]
 """Whether bundle adjustment of matches between the photos follows (docs/refinement.md); `auto`: where its extra is
 installed."""
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from freegeo.models.api import ReconstructionModel
     from freegeo.models.precision import Compute
     from freegeo.models.spec import ModelSpec
+    from freegeo.sequence_job import Plan
     from freegeo.types import PhotoLike
 
 
@@ -263,8 +265,9 @@ def _read_like(example: object, text: str) -> object:
 class PhotoOptions:
     """Which photos are used, and how."""
 
-    max_views: int = MAX_VIEWS
-    """Most photos that are used; of more, as many are chosen evenly."""
+    max_views: int | None = None
+    """Most photos that are used; of more, as many are chosen evenly. Default: all photos of a folder; of a video 32
+    frames, or all that --fps takes."""
     fps: float | None = None
     """Videos: take a frame this often per second; default: by sharpness and parallax."""
     skip_bad: bool = False
@@ -314,6 +317,61 @@ class PlacingOptions:
     scale: str | None = None
     """Where metres come from: gps, a measured distance such as "a.jpg:812,410 b.jpg:655,398 = 1.25" (column and row
     of two places, and metres), or a text file of these."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class SequenceOptions:
+    """How more photos than are predicted at once become one result (docs/sequences.md)."""
+
+    chunk: str = "auto"
+    """Photos that are predicted together; of more, chunks are predicted one after the other and joined. auto: as many
+    as fit into memory, at most as many as suit the model."""
+    overlap: int | None = None
+    """Photos that two neighbouring chunks share. Default: half of a chunk."""
+    loops: bool = True
+    """Look for places that the photos come back to, and let them correct the way between."""
+    order: OrderRule = "auto"
+    """Order of the photos: given; similar: by what they show; auto: given, unless neighbours do not look alike."""
+
+    def plan(
+        self, model: ReconstructionModel, photos: Sequence[PhotoLike], mixed: Mixed, compute: Compute
+    ) -> Plan | None:
+        """Return how photos are cut into chunks; None where all are predicted at once."""
+        from freegeo.adaptation.memory import plan_reconstruction
+        from freegeo.models.images import read_some
+        from freegeo.sequence.chunks import OVERLAP, plan_chunks
+        from freegeo.sequence_job import Plan
+
+        count, image_hw = len(photos), read_some(model, photos, [0], mixed).image_hw
+        _, fitting = plan_reconstruction(model, 1, image_hw, compute=compute)
+        size = min(fitting, model.spec.chunk) if self.chunk == "auto" else self._size()
+        if min(size, count) > fitting:
+            raise UserError(
+                f"--chunk {size}: at most {fitting} photos of {image_hw[1]} x {image_hw[0]} pixels fit into memory "
+                f"together with {model.spec.name}. Take --chunk {fitting}, or auto."
+            )
+        overlap = max(1, int(size * OVERLAP)) if self.overlap is None else self.overlap
+        chunks = plan_chunks(count, size, overlap)
+        if len(chunks) == 1:
+            return None
+        if not model.spec.cameras:
+            raise UserError(
+                f"{model.spec.name} predicts no cameras, so that chunks of {count} photos cannot be joined. Take "
+                "another model, or --max-views."
+            )
+        parts, _ = plan_reconstruction(model, size, image_hw, compute=compute)
+        peak = sum(bytes for _, bytes in parts)
+        console.note(
+            f"{count} photos in {len(chunks)} chunks of {size}, neighbours share {overlap}: about {peak / 1e9:.1f} GB "
+            "of memory at a time"
+        )
+        return Plan(size=size, overlap=overlap, order=self.order, loops=self.loops)
+
+    def _size(self) -> int:
+        if not self.chunk.isdecimal() or int(self.chunk) < 2:
+            raise UserError(f"--chunk is auto or a number of photos from 2 on, got '{self.chunk}'.")
+        return int(self.chunk)
 
 
 @Parameter(name="*")

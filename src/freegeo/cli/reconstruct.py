@@ -13,13 +13,14 @@ from freegeo.cli.options import (
     PhotoOptions,
     PlacingOptions,
     Refine,
+    SequenceOptions,
     refines_with,
 )
 from freegeo.cli.sources import load_source
 from freegeo.models.spec import PoseFrom
 
 DEFAULT_MODEL, DEFAULT_PHOTOS = ModelOptions(), PhotoOptions()
-NO_CAMERAS, DEFAULT_PLACING = CameraOptions(), PlacingOptions()
+NO_CAMERAS, DEFAULT_PLACING, DEFAULT_SEQUENCE = CameraOptions(), PlacingOptions(), SequenceOptions()
 
 
 def reconstruct(
@@ -29,6 +30,7 @@ def reconstruct(
     photos: PhotoOptions = DEFAULT_PHOTOS,
     cameras: CameraOptions = NO_CAMERAS,
     placing: PlacingOptions = DEFAULT_PLACING,
+    sequence: SequenceOptions = DEFAULT_SEQUENCE,
     files: FileOptions = DEFAULT_FILES,
     adapter: Path | None = None,
     refine: Refine = "off",
@@ -59,5 +61,5 @@ def reconstruct(
     model.warn_of_embedded(sources)
     run_job(
         found, model, output, command="reconstruct", recipe=None, adapter=adapter, mixed=photos.mixed, files=files,
-        refine=refine, pose_from=pose_from, cameras=cameras, placing=placing,
+        refine=refine, pose_from=pose_from, cameras=cameras, placing=placing, sequence=sequence,
     )  # fmt: skip

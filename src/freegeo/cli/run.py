@@ -13,13 +13,14 @@ from freegeo.cli.options import (
     PlacingOptions,
     RecipeOptions,
     Refine,
+    SequenceOptions,
     refines_with,
 )
 from freegeo.cli.sources import load_source
 from freegeo.models.spec import PoseFrom
 
 DEFAULT_RECIPE, DEFAULT_MODEL, DEFAULT_PHOTOS = RecipeOptions(), ModelOptions(), PhotoOptions()
-NO_CAMERAS, DEFAULT_PLACING = CameraOptions(), PlacingOptions()
+NO_CAMERAS, DEFAULT_PLACING, DEFAULT_SEQUENCE = CameraOptions(), PlacingOptions(), SequenceOptions()
 
 
 def run(
@@ -30,6 +31,7 @@ def run(
     photos: PhotoOptions = DEFAULT_PHOTOS,
     cameras: CameraOptions = NO_CAMERAS,
     placing: PlacingOptions = DEFAULT_PLACING,
+    sequence: SequenceOptions = DEFAULT_SEQUENCE,
     files: FileOptions = DEFAULT_FILES,
     adapt: bool = True,
     guard: Guard = "select",
@@ -61,5 +63,5 @@ def run(
     plan = recipe if adapt else None
     run_job(
         found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files, guard=guard, refine=refine,
-        pose_from=pose_from, cameras=cameras, placing=placing,
+        pose_from=pose_from, cameras=cameras, placing=placing, sequence=sequence,
     )  # fmt: skip

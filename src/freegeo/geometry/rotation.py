@@ -84,13 +84,17 @@ def rotation_angle(matrix_a: Tensor, matrix_b: Tensor) -> Tensor:
     return torch.atan2(torch.linalg.vector_norm(twice_sine, dim=-1), twice_cosine)
 
 
-def mean_rotation(matrices: Tensor) -> Tensor:
-    """Rotation matrix (..., 3, 3) nearest to the mean of rotation matrices (..., S, 3, 3).
+def mean_rotation(matrices: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Rotation matrix (..., 3, 3) nearest to the mean of rotation matrices (..., S, 3, 3), by weights (..., S).
 
     The mean of the entries is projected onto the rotations by its singular vectors (the chordal mean), with the sign of
     the last one turned where the projection would be a reflection.
     """
-    U, _, Vh = torch.linalg.svd(matrices.mean(dim=-3))
+    if weights is None:
+        mean = matrices.mean(dim=-3)
+    else:
+        mean = (weights[..., None, None] * matrices).sum(dim=-3) / weights.sum(-1)[..., None, None]
+    U, _, Vh = torch.linalg.svd(mean)
     signs = torch.ones_like(U[..., 0, :])
     signs[..., 2] = torch.linalg.det(U @ Vh).sign()
     return (U * signs[..., None, :]) @ Vh

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,6 +25,8 @@ logger = logging.getLogger(__name__)
 
 Size = tuple[int, int]
 """Height and width."""
+_AT_A_TIME = 16
+"""Photos that are held in memory while all of many are looked at."""
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
@@ -43,10 +48,92 @@ def read_photos(model: ReconstructionModel, photos: Sequence[PhotoLike], *, mixe
     if mixed not in get_args(Mixed):
         raise UserError(f"mixed is one of {', '.join(get_args(Mixed))}, not {mixed!r}.")
     batch = model.preprocess(photos, mixed=mixed)
+    _warn(batch, mixed)
+    return batch
+
+
+def look_at_photos(model: ReconstructionModel, photos: Sequence[PhotoLike], *, mixed: Mixed = MIXED) -> Frames:
+    """Read each of many photos once, a few at a time, and warn as `read_photos`; their pixels are read again later.
+
+    Errors as `read_photos`.
+    """
+    if mixed not in get_args(Mixed):
+        raise UserError(f"mixed is one of {', '.join(get_args(Mixed))}, not {mixed!r}.")
+    contents, looks = hashlib.sha256(), []
+    for start in range(0, len(photos), _AT_A_TIME):
+        batch = read_some(model, photos, range(start, min(start + _AT_A_TIME, len(photos))), mixed)
+        contents.update(batch.digest().encode())
+        looks.append(replace(batch, images=batch.images[:, :, :0, :0]))
+        shape = batch.images.shape[1:]
+    geometry = {name: torch.cat([getattr(b, name) for b in looks]) for name in ("photo_hw", "scale_xy", "offset_xy")}
+    frames = Frames(
+        images=torch.zeros(()).expand(len(photos), *shape), names=tuple(photo.name for photo in photos), **geometry,
+        contents=contents.hexdigest(), photos=tuple(photos), chosen=tuple(range(len(photos))), model=model, mixed=mixed,
+    )  # fmt: skip
+    _warn(frames, mixed)
+    return frames
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frames(ImageBatch):
+    """Many photos at the model's size, which are read when they are needed; `images` has their shape and no pixels."""
+
+    contents: str
+    """Fingerprint of the pixels of all photos."""
+    photos: tuple[PhotoLike, ...]
+    """All photos that are read at one size."""
+    chosen: tuple[int, ...]
+    """Those of the batch, in its order."""
+    model: ReconstructionModel
+    mixed: Mixed
+
+    def select(self, views: Sequence[int]) -> Frames:
+        """Return the chosen views, in the order given, not read yet."""
+        index = list(views)
+        return replace(
+            self, images=self.images[: len(index)], names=tuple(self.names[i] for i in index),
+            photo_hw=self.photo_hw[index], scale_xy=self.scale_xy[index], offset_xy=self.offset_xy[index],
+            chosen=tuple(self.chosen[i] for i in index),
+        )  # fmt: skip
+
+    def read(self) -> ImageBatch:
+        """Read the pixels: each view as it would be beside all photos."""
+        return read_some(self.model, self.photos, self.chosen, self.mixed)
+
+    def digest(self) -> str:
+        """Return a fingerprint of the pixels."""
+        return hashlib.sha256(f"{self.contents} {self.chosen}".encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SizeOnly:
+    """A photo that has a say in the size of the images beside it, and is not among them."""
+
+    name: str
+    size_hw: Size
+
+    def read(self) -> np.ndarray:
+        """Return white, for models of others that read every photo."""
+        return np.full((*self.size_hw, 3), WHITE, np.uint8)
+
+
+def read_some(
+    model: ReconstructionModel, photos: Sequence[PhotoLike], chosen: Sequence[int], mixed: Mixed
+) -> ImageBatch:
+    """Preprocess the chosen ones of photos to the size that all of them have together."""
+    wanted = [photos[number] for number in chosen]
+    if len({photo.size_hw for photo in photos}) == 1:
+        return model.preprocess(wanted, mixed=mixed)
+    left = set(range(len(photos))) - set(chosen)
+    others = [SizeOnly(name=photos[number].name, size_hw=photos[number].size_hw) for number in sorted(left)]
+    batch = model.preprocess([*wanted, *others], mixed=mixed)
+    return batch if len(batch) == len(wanted) else batch.select(range(len(wanted)))
+
+
+def _warn(batch: ImageBatch, mixed: Mixed) -> None:
     for sentence in (_cut_sentence(batch, mixed), _enlarged_sentence(batch)):
         if sentence:
             logger.warning(sentence)
-    return batch
 
 
 def _cut_sentence(batch: ImageBatch, mixed: Mixed) -> str | None:
@@ -139,7 +226,7 @@ def images_of_one_size(
     """Read photos, resize them, and cut or pad them, with the photo in the middle, to one size.
 
     Args:
-        photos: what is read.
+        photos: what is read, but for those that are `SizeOnly`.
         sizes: what the model makes of each photo alone: whole patches.
         resize: resizes photo number i (H, W, 3) uint8 to `sizes[i]`.
         mixed: how one size comes about.
@@ -155,17 +242,19 @@ def images_of_one_size(
     else:
         common = largest if mixed == "pad" or upstream == "largest" else smallest
     images, offsets = [], []
-    for number, (photo, own, target) in enumerate(zip(photos, sizes, targets, strict=True)):
+    shown = [number for number, photo in enumerate(photos) if not isinstance(photo, SizeOnly)]
+    for number in shown:
+        photo, own, target = photos[number], sizes[number], targets[number]
         pixels = torch.from_numpy(photo.read())
         pixels = resize(pixels, number) if target == own else _resized(pixels, target)
         top, left = (_offset(common[axis] - target[axis]) for axis in (0, 1))
         images.append(_placed(pixels, common, top, left).permute(2, 0, 1))
         offsets.append([float(left), float(top)])
-    heights, widths = torch.tensor(targets).unbind(-1)
-    photo_hw = torch.tensor([photo.size_hw for photo in photos])
+    heights, widths = torch.tensor([targets[number] for number in shown]).unbind(-1)
+    photo_hw = torch.tensor([photos[number].size_hw for number in shown])
     return ImageBatch(
         images=torch.stack(images).float() / 255,
-        names=tuple(photo.name for photo in photos),
+        names=tuple(photos[number].name for number in shown),
         photo_hw=photo_hw,
         scale_xy=torch.stack((widths, heights), dim=-1).double() / photo_hw.flip(-1),
         offset_xy=torch.tensor(offsets, dtype=torch.float64),

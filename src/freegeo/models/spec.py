@@ -67,6 +67,8 @@ class ModelSpec:
     """Whether it can also find cameras from a ray map."""
     caution: str | None = None
     """A sentence on its results that everyone who uses it has to read."""
+    chunk: int = 120
+    """Views that are predicted together unless more are asked for: longer sequences are cut into chunks."""
     takes: Takes = "nothing"
     """What the model can be told of its views (`freegeo.types.Priors`)."""
 

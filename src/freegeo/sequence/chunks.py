@@ -1,0 +1,62 @@
+"""Which frames of a sequence are predicted together (docs/sequences.md, "Chunks")."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from freegeo.errors import UserError
+
+OVERLAP = 0.5
+"""Share of a chunk that is in the next one too, unless it is given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chunk:
+    """Frames that a model sees together."""
+
+    frames: tuple[int, ...]
+    """Ascending."""
+    loop: bool = False
+    """Whether it only ties two places of the sequence together, and gives no frames to the result."""
+
+    def __str__(self) -> str:
+        """Return its frames, such as "12-35", or "12-19 and 280-287"."""
+        return " and ".join(f"{run[0]}-{run[-1]}" for run in runs(self.frames))
+
+
+def plan_chunks(count: int, size: int, overlap: int) -> list[Chunk]:
+    """Cut `count` frames into chunks of `size`, each of which shares `overlap` frames with the one before it.
+
+    Every chunk but the last is full, and the last one has more than `overlap` frames.
+
+    Raises:
+        UserError: a size below 2, or an overlap that is not from 1 to size - 1.
+    """
+    if size < 2:
+        raise UserError(f"--chunk must be at least 2 frames, got {size}.")
+    if not 1 <= overlap < size:
+        raise UserError(
+            f"--overlap must be from 1 to {size - 1}, less than the {size} frames of a chunk, got {overlap}."
+        )
+    step = size - overlap
+    chunks = max(1, -(-(count - overlap) // step))
+    return [Chunk(frames=tuple(range(k * step, min(k * step + size, count)))) for k in range(chunks)]
+
+
+def common_rows(first: Chunk, second: Chunk) -> list[tuple[int, int]]:
+    """Return the places of the frames that two chunks share: (row in first, row in second)."""
+    place = {frame: row for row, frame in enumerate(second.frames)}
+    return [(row, place[frame]) for row, frame in enumerate(first.frames) if frame in place]
+
+
+def runs(numbers: Sequence[int]) -> Iterator[list[int]]:
+    """Split ascending numbers into runs without gaps."""
+    run: list[int] = []
+    for number in numbers:
+        if run and number != run[-1] + 1:
+            yield run
+            run = []
+        run.append(number)
+    if run:
+        yield run

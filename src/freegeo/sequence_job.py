@@ -1,0 +1,521 @@
+"""What `freegeo run` and `reconstruct` do with more photos than are predicted at once (docs/sequences.md).
+
+Each chunk is a job with a folder of its own, and one adapter is trained for all. A stopped run continues at the first
+chunk that is not finished.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from freegeo import files
+from freegeo.adaptation.adapt import Adapted
+from freegeo.data.video import VideoFrame
+from freegeo.errors import FreeGeoError, LostFolderError, UserError
+from freegeo.export.base import KEPT_NAME
+from freegeo.export.pixels import masks_for_model
+from freegeo.export.reconstruction import Reconstruction, Scale, save_streamed
+from freegeo.files import remove_written, write_json
+from freegeo.job import (
+    ADAPTATION,
+    FILES_STAGE,
+    FILTERS,
+    FORMATS,
+    FROZEN_FOLDER,
+    MATCHES_NAME,
+    PLACING,
+    PREDICTION,
+    PREDICTION_NAME,
+    REFINEMENT,
+    SUMMARY_NAME,
+    Adaptation,
+    Computed,
+    Hooks,
+    Job,
+    write_files,
+)
+from freegeo.metres import Gps, in_metres
+from freegeo.pipeline import capital, judge_by_photos, scene_images
+from freegeo.posed import doubt_focal_length, with_one_camera
+from freegeo.report.page import write_report
+from freegeo.run_folder import Part
+from freegeo.sequence.assembly import Assembly, assemble
+from freegeo.sequence.chunks import Chunk, plan_chunks
+from freegeo.sequence.join import Joined, Member
+from freegeo.sequence.loops import Loop, loop_candidates, loop_frames, verified
+from freegeo.sequence.order import descriptors, in_order, similarity_order
+
+if TYPE_CHECKING:
+    from freegeo.adaptation.adapter import Adapter
+    from freegeo.adaptation.samples import SceneImages
+    from freegeo.cameras.known import KnownCameras
+    from freegeo.evidence.matches import Matches
+    from freegeo.models.api import ReconstructionModel
+    from freegeo.types import ImageBatch, PhotoLike
+
+logger = logging.getLogger(__name__)
+
+CHUNKS_FOLDER = "chunks"
+PIECES_FOLDER = "pieces"
+DESCRIPTORS_NAME = f"{CHUNKS_FOLDER}/descriptors.npz"
+JOINING = Part("joining", (PREDICTION_NAME, KEPT_NAME, f"{PIECES_FOLDER}/"), free=True)
+SEQUENCE_PARTS = (
+    ADAPTATION, replace(PREDICTION, files=(f"{CHUNKS_FOLDER}/",)), PLACING, REFINEMENT, JOINING, FILTERS, FORMATS,
+)  # fmt: skip
+"""Parts of the settings of a job with chunks: as `freegeo.job.PARTS`, and how chunks are put together."""
+LOOP_APART = 2
+"""Frames of a loop are at least so many chunks apart."""
+_READ_AT_ONCE = 16
+_KNOWN_MEDIANS = ("scale", "spread", "rotation_deg", "position", "focal")
+"""What is said of known cameras as the median over chunks."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """How a sequence is cut into chunks and put together."""
+
+    size: int
+    """Frames of a chunk."""
+    overlap: int
+    """Frames that two neighbouring chunks share."""
+    order: Literal["auto", "given", "similar"] = "auto"
+    """Order of the photos: as they are given, by what they show, or by what they show unless neighbours look alike."""
+    loops: bool = True
+    """Whether places that the sequence comes back to are looked for."""
+
+
+@dataclass(kw_only=True)
+class SequenceJob(Job):
+    """The inputs and settings that turn many photos into an output folder; `batch` is read when it is needed."""
+
+    plan: Plan
+    failed: dict[int, str] = field(default_factory=dict)
+    """Chunk -> why there is no prediction of it."""
+    uses_adapter: bool = False
+    """Whether the result is that of the adapter, trained or given."""
+    order: Literal["given", "similar"] = "given"
+
+    def run(self) -> dict[str, Any]:
+        """Write everything and return the content of reconstruction.json."""
+        self._put_in_order()
+        chunks = plan_chunks(len(self.batch), self.plan.size, self.plan.overlap)
+        adaptation = self._adapted(chunks)
+        self.uses_adapter = self.adapter is not None or adaptation.used
+        for number in range(len(chunks)):
+            self._attempt(chunks, number, ChunkJob.make)
+        if len(self.failed) == len(chunks):
+            raise FreeGeoError(f"no chunk could be predicted: {capital(next(iter(self.failed.values())))}")
+        loops, tied = self._loops() if self.plan.loops else ([], [])
+        numbers = [number for number in range(len(chunks)) if number not in self.failed]
+        parts = [*(chunks[number] for number in numbers), *tied]
+        names = [*(_chunk_name(number) for number in numbers), *map(_loop_name, tied)]
+        load = [partial(Reconstruction.load, self.folder / CHUNKS_FOLDER / name) for name in names]
+        with self._timed("seams between chunks", JOINING):
+            found = assemble(parts, lambda number: load[number](), fixed_scale=self.spec.metric, placed=self._is_placed)
+        pieces = [[Member(chunk=parts[k], sim3=found.sim3[k], load=load[k]) for k in piece] for piece in found.pieces]
+        told = self._told_of(chunks, numbers, found, loops, pieces)
+        return self._write(pieces, told, adaptation)
+
+    # -- before the chunks
+
+    def _put_in_order(self) -> None:
+        """Bring photos that are no sequence into one by what they show; the order is noted down."""
+        assert self.photos is not None
+        noted = self._noted("prediction")
+        if "order" not in noted:
+            by_sight = self.plan.order == "similar" or (
+                self.plan.order == "auto"
+                and not all(isinstance(photo, VideoFrame) for photo in self.photos)
+                and not in_order(self.descriptors)
+            )
+            order = similarity_order(self.descriptors) if by_sight else None
+            self.folder.note("prediction", {**noted, "order": order})
+            if by_sight:
+                # Those that are there are of the order given.
+                remove_written(self.folder / DESCRIPTORS_NAME)
+                vars(self).pop("descriptors")
+        order = self._noted("prediction")["order"]
+        if order is None:
+            return
+        logger.info("photos are put in an order in which neighbours look alike (--order given keeps theirs)")
+        self.order = "similar"
+        self.batch = self.batch.select(order)
+        self.photos = [self.photos[i] for i in order]
+        self.known = None if self.known is None else self.known.select(order)
+        self.priors = None if self.priors is None else self.priors.select(order)
+        self.masks = None if self.masks is None else [self.masks[i] for i in order]
+        self.scale = self.scale.select(order) if isinstance(self.scale, Gps) else self.scale
+
+    @cached_property
+    def descriptors(self) -> np.ndarray:
+        """What each frame shows, (N, C) of unit length."""
+        file = self.folder / DESCRIPTORS_NAME
+        if file.is_file():
+            with np.load(file, allow_pickle=False) as content:
+                return content["descriptors"]
+        count = len(self.batch)
+        with self._timed("what each photo shows"):
+            parts = (
+                self.batch.select(range(start, min(start + _READ_AT_ONCE, count))).read().images
+                for start in range(0, count, _READ_AT_ONCE)
+            )
+            found = descriptors(self.model, parts, self.compute)
+            files.write_npz(file, {"descriptors": found})
+        return found
+
+    def _adapted(self, chunks: Sequence[Chunk]) -> Adaptation:
+        """Predict all chunks with the frozen model, and train one adapter for all; without a recipe, nothing."""
+        if self.recipe is None:
+            return Adaptation()
+        for number in range(len(chunks)):
+            self._attempt(chunks, number, ChunkJob.frozen)
+        self.numbers = [number for number in range(len(chunks)) if number not in self.failed]
+        self.chunks = [chunks[number] for number in self.numbers]
+        rejected, verdict = self._trained(self.recipe, None)
+        used = rejected is None and not (verdict and self.guard == "select" and verdict["outcome"] != "adapted")
+        if rejected is not None:
+            self._warn(f"{capital(rejected)} The result is that of the frozen model.")
+        return Adaptation(used=used, rejected=rejected, verdict=verdict)
+
+    def _scene_images(self, model: ReconstructionModel) -> SceneImages:
+        assert self.photos is not None and self.recipe is not None
+        images = scene_images("photos", self.photos, model, self.recipe, self.batch, self.priors)
+        return images
+
+    def _judge(self, result: Adapted, frozen: Reconstruction | None, judging: list[Matches] | None) -> None:
+        """Let the guard judge a finished adapter once, by all chunks."""
+        assert self.photos is not None
+        frames = [list(chunk.frames) for chunk in self.chunks]
+        places = [self.folder / CHUNKS_FOLDER / _chunk_name(number) for number in self.numbers]
+        judge_by_photos(
+            self.model, result, [([self.photos[i] for i in own], self.batch.select(own)) for own in frames],
+            compute=self.compute, guard=self.guard, reference=self.reference,
+            frozen=[Reconstruction.load(place / FROZEN_FOLDER) for place in places],
+            stores=[place / MATCHES_NAME for place in places],
+            priors=None if self.priors is None else [self.priors.select(own) for own in frames],
+            pose_from=self.pose_from,
+        )  # fmt: skip
+
+    # -- chunks
+
+    def _job(self, chunk: Chunk, number: int | None = None, count: int = 0) -> ChunkJob:
+        """Return the job of a chunk; a loop has no number."""
+        assert self.photos is not None
+        frames = list(chunk.frames)
+        name = _loop_name(chunk) if number is None else _chunk_name(number)
+        label = f"chunk {number + 1} of {count}, frames {chunk}" if number is not None else f"loop of frames {chunk}"
+        values = {f.name: getattr(self, f.name) for f in fields(Job)}
+        values |= {
+            "batch": self.batch.select(frames), "photos": [self.photos[i] for i in frames],
+            "folder": self.folder.sub(f"{CHUNKS_FOLDER}/{name}"),
+            "known": None if self.known is None else self.known.select(frames),
+            "priors": None if self.priors is None else self.priors.select(frames), "masks": None, "scale": None,
+            "hooks": Hooks(stage=lambda stage: self.hooks.stage(f"{label}: {stage}")),
+        }  # fmt: skip
+        return ChunkJob(**values, whole=self, loop=chunk.loop)
+
+    def _attempt(self, chunks: Sequence[Chunk], number: int, work: Callable[[ChunkJob], object]) -> None:
+        """Do something with a chunk; go on without it, and say so, when there is no usable prediction of it."""
+        if number in self.failed:
+            return
+        try:
+            work(self._job(chunks[number], number, len(chunks)))
+        except (UserError, LostFolderError):
+            raise
+        except FreeGeoError as error:
+            self.failed[number] = str(error)
+            self._warn(f"Chunk {number + 1} (frames {chunks[number]}) is left out: {error}")
+
+    def _loops(self) -> tuple[list[Loop], list[Chunk]]:
+        """Look for places that the sequence comes back to: what was found, and a chunk for each one that holds."""
+        assert self.photos is not None
+        noted = self._noted("joining")
+        if "loops" not in noted:
+            with self._timed("places seen twice", JOINING):
+                candidates = loop_candidates(self.descriptors, apart=LOOP_APART * self.plan.size)
+                found = verified(candidates, self.photos)
+                self.folder.note("joining", {**self._noted("joining"), "loops": [asdict(loop) for loop in found]})
+        loops = [Loop(**values) for values in self._noted("joining")["loops"]]
+        tied = []
+        for number, loop in enumerate(loops):
+            if loop.reason is None:
+                frames = loop_frames(loop.first, loop.second, len(self.batch), self.plan.size)
+                chunk = Chunk(frames=frames, loop=True)
+                reason = self._refuted(chunk, loop)
+                if reason is None:
+                    tied.append(chunk)
+                else:
+                    loops[number] = replace(loop, reason=reason)
+        return loops, tied
+
+    def _refuted(self, chunk: Chunk, loop: Loop) -> str | None:
+        """Predict the frames around both ends of a loop together; returns why that cannot be used."""
+        try:
+            self._job(chunk).make()
+        except (UserError, LostFolderError):
+            raise
+        except FreeGeoError as error:
+            return str(error)
+        return None
+
+    @property
+    def _is_placed(self) -> bool:
+        """Whether all chunks are in the frame of known cameras."""
+        return self.known is not None and bool(self.known.has_pose.all())
+
+    # -- the result
+
+    def _told_of(
+        self, chunks: Sequence[Chunk], numbers: Sequence[int], found: Assembly, loops: Sequence[Loop],
+        pieces: Sequence[Sequence[Member]],
+    ) -> dict[str, Any]:  # fmt: skip
+        """Return what reconstruction.json says of the sequence."""
+        piece_of = {numbers[k]: number for number, piece in enumerate(found.pieces) for k in piece}
+        # Chunks that are left out have no seams, and those of loops are numbered after all others.
+        ties = sum(1 for loop in loops if loop.reason is None)
+        number_of = [*numbers, *range(len(chunks), len(chunks) + ties)]
+        refined = self.folder.notes.get("refinement") or {}
+        frames = _frames_of(pieces)
+        return {
+            "frames": len(self.batch), "order": self.order, "chunk": self.plan.size, "overlap": self.plan.overlap,
+            "chunks": [
+                {
+                    "number": number, "first": chunk.frames[0], "last": chunk.frames[-1], "frames": len(chunk.frames),
+                    "piece": piece_of.get(number), "reason": self.failed.get(number),
+                    "refined": refined.get(f"{CHUNKS_FOLDER}/{_chunk_name(number)}", {}).get("accepted"),
+                }
+                for number, chunk in enumerate(chunks)
+            ],
+            "seams": [
+                {**joint.as_dict(), "first": number_of[joint.first], "second": number_of[joint.second]}
+                for joint in found.joints
+            ],
+            "loops": [
+                {"first": loop.first, "second": loop.second, "similarity": loop.similarity, "matches": loop.matches,
+                 "used": loop.reason is None, "reason": loop.reason}
+                for loop in loops
+            ],
+            "pieces": [
+                {"folder": _piece_folder(k), "first": own[0], "last": own[-1], "frames": len(own)}
+                for k, own in enumerate(frames)
+            ],
+        }  # fmt: skip
+
+    def _write(
+        self, pieces: Sequence[Sequence[Member]], told: dict[str, Any], adaptation: Adaptation
+    ) -> dict[str, Any]:
+        """Join each piece and write its files; the first one is the result, with what is said of the whole."""
+        parts, missing = told["pieces"], len(self.batch) - sum(part["frames"] for part in told["pieces"])
+        if len(parts) > 1:
+            others = ", ".join(f"frames {part['first']} to {part['last']} in {part['folder']}" for part in parts[1:])
+            self._warn(
+                f"The photos fall into {len(parts)} pieces whose places to each other are not known, since chunks do "
+                f"not fit together: the result is that of frames {parts[0]['first']} to {parts[0]['last']}, and there "
+                f"are {others}. Photos of what lies between would join them."
+            )
+        if missing:
+            self._warn(f"{missing} of {len(self.batch)} photos are in no chunk that could be predicted.")
+        summary: dict[str, Any] = {}
+        for number, (members, frames) in reversed(list(enumerate(zip(pieces, _frames_of(pieces), strict=True)))):
+            summary = self._write_piece(number, members, frames, told if number == 0 else None, adaptation)
+        self.after(self)
+        self.folder.finish()
+        return summary
+
+    def _write_piece(
+        self, number: int, members: Sequence[Member], frames: Sequence[int], told: dict[str, Any] | None,
+        adaptation: Adaptation,
+    ) -> dict[str, Any]:  # fmt: skip
+        assert self.photos is not None
+        folder, photos = self.folder.path / _piece_folder(number), [self.photos[i] for i in frames]
+        label = "" if number == 0 else f"piece {number + 1}: "
+        self.hooks.stage(f"{label}joining {len(members)} chunks")
+        result, about = self._joined(folder, members, frames, photos)
+        if result.has_cameras:
+            doubt_focal_length(result, photos)
+        with self._timed(f"{label}{FILES_STAGE}", FILTERS):
+            wanted = None if self.masks is None else masks_for_model(result, [self.masks[i] for i in frames])
+            report, failed = write_files(
+                folder, result, self.formats, filters=self.filters, masks=wanted, photos=photos, seed=self.seed
+            )
+        found = Computed(result=result, about=about, adaptation=adaptation)
+        summary = self._summary(found, report, failed, photos=photos, sequence=told)
+        write_json(folder / SUMMARY_NAME, summary)
+        self.hooks.stage(f"{label}report")
+        write_report(folder, photos=photos)
+        return summary
+
+    def _joined(
+        self, folder: Path, members: Sequence[Member], frames: Sequence[int], photos: Sequence[PhotoLike]
+    ) -> tuple[Reconstruction, dict[str, Any]]:
+        """Write the prediction of a piece, one frame after the other, and return it as it is on disk."""
+        joined = Joined(members, frames)
+        batch, scale = self.batch.select(frames), _common_scale(members)
+        T_cam_world, K = joined.T_cam_world, joined.K
+        about: dict[str, Any] = {"known_cameras": self._about_known(), "one_camera": None}
+
+        def save(factor: float = 1.0) -> Reconstruction:
+            save_streamed(
+                folder, names=batch.names, photo_hw=batch.photo_hw.numpy(), scale_xy=batch.scale_xy.numpy(),
+                offset_xy=batch.offset_xy.numpy(), T_cam_world=T_cam_world, K=K, scale=scale,
+                blocks=lambda name: joined.blocks(name, factor), sky=joined.has_sky,
+            )  # fmt: skip
+            return Reconstruction.load(folder)
+
+        if self.one_camera:
+            known = None if self.known is None else self.known.select(list(frames))
+            K, about["one_camera"] = _shared_K(K, batch, photos, known)
+        result = save()
+        if self.scale is not None:
+            source = self.scale.select(frames) if isinstance(self.scale, Gps) else self.scale
+            metric = in_metres(result, source, photos)
+            if metric is not result:
+                assert metric.scale is not None
+                T_cam_world, scale = metric.cameras()[0], metric.scale
+                result = save(scale.value)
+        return result, about
+
+    def _about_known(self) -> dict[str, Any] | None:
+        """Return what known cameras made of the chunks: sums and medians of what is said of each."""
+        noted = self.folder.notes.get("placing") or {}
+        told = [
+            value["known_cameras"] for value in noted.values() if isinstance(value, dict) and value.get("known_cameras")
+        ]
+        if self.known is None or not told:
+            return None
+        medians = _medians([{name: one[name] for name in _KNOWN_MEDIANS} for one in told])
+        measured = [one["measured"] for one in told if one.get("measured")]
+        sums = {name: sum(one[name] for one in measured) for name in ("points", "views")}
+        return {
+            **told[0], **(medians or {}), "poses": int(self.known.has_pose.sum()),
+            "intrinsics": int(self.known.has_K.sum()),
+            "measured": {**(_medians(measured) or {}), **sums} if measured else None,
+        }  # fmt: skip
+
+    def _refinement(self) -> dict[str, Any] | None:
+        """Return what refinement made of the chunks; scores are medians over those where it was accepted."""
+        noted = self.folder.notes.get("refinement") or {}
+        told = [value for name, value in noted.items() if name.startswith(CHUNKS_FOLDER) and "accepted" in value]
+        if not told:
+            return None
+        accepted = [one for one in told if one["accepted"]]
+        refused = Counter(one["reason"] for one in told if not one["accepted"])
+        reason = f"The cameras of {len(accepted)} of {len(told)} chunks were brought to matches that prove them."
+        if refused:
+            reason += f" Of the others, most often: {refused.most_common(1)[0][0]}"
+        return {
+            "accepted": bool(accepted), "reason": reason, "told": any(one["told"] for one in told),
+            "lacking": None if accepted else Counter(one["lacking"] for one in told).most_common(1)[0][0],
+            "probability": _median(one["probability"] for one in accepted), "misfit": None,
+            "pairs": sum(one["pairs"] for one in accepted),
+            **{name: _medians([one[name] for one in accepted]) for name in ("frozen", "before", "after")},
+        }  # fmt: skip
+
+    def _seconds(self) -> dict[str, float]:
+        total: dict[str, float] = {}
+        for part in self.folder.notes.values():
+            own = [part, *(value for name, value in part.items() if name.startswith(CHUNKS_FOLDER))]
+            for name, value in (item for one in own for item in one.get("seconds", {}).items()):
+                total[name] = round(total.get(name, 0.0) + value, 2)
+        return total
+
+
+def _chunk_name(number: int) -> str:
+    return f"{number:04d}"
+
+
+def _loop_name(chunk: Chunk) -> str:
+    return f"loop-{chunk.frames[0]:06d}-{chunk.frames[-1]:06d}"
+
+
+def _piece_folder(number: int) -> str:
+    """Where a piece is, below the output folder; the first one is the result itself."""
+    return "." if number == 0 else f"{PIECES_FOLDER}/{number + 1}"
+
+
+def _frames_of(pieces: Sequence[Sequence[Member]]) -> list[list[int]]:
+    """Return the frames of each piece; one that two pieces have is in the first of them only."""
+    taken: set[int] = set()
+    found = []
+    for members in pieces:
+        own = sorted({frame for member in members for frame in member.chunk.frames} - taken)
+        taken.update(own)
+        found.append(own)
+    return found
+
+
+def _common_scale(members: Sequence[Member]) -> Scale | None:
+    """Return what the lengths of chunks being metres rests on; None where they are up to scale."""
+    scales = [member.load().scale for member in members]
+    known = [scale for scale in scales if scale is not None]
+    if len(known) < len(scales):
+        return None
+    spread = _median(scale.spread for scale in known)
+    return Scale(value=float(np.median([scale.value for scale in known])), source=known[0].source, spread=spread)
+
+
+def _shared_K(
+    K: np.ndarray, batch: ImageBatch, photos: Sequence[PhotoLike], known: KnownCameras | None
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Give photos of one camera one focal length (`with_one_camera`); pixels have no part in that."""
+    maps = np.broadcast_to(np.float32(1), (len(batch), *batch.image_hw))
+    bare = Reconstruction(
+        depth_z=maps, conf=maps, images=np.broadcast_to(np.uint8(0), (*maps.shape, 3)), names=batch.names,
+        photo_hw=batch.photo_hw.numpy(), scale_xy=batch.scale_xy.numpy(), offset_xy=batch.offset_xy.numpy(),
+        T_cam_world=np.broadcast_to(np.eye(4), (len(batch), 4, 4)), K=K,
+    )  # fmt: skip
+    shared, about = with_one_camera(bare, photos, known)
+    return shared.cameras()[1], about
+
+
+def _median(values: Iterable[float | None]) -> float | None:
+    found = [value for value in values if value is not None]
+    return float(np.median(found)) if found else None
+
+
+def _medians(scores: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
+    found = [one for one in scores if one]
+    return {name: _median(one.get(name) for one in found) for name in found[0]} if found else None
+
+
+@dataclass(kw_only=True)
+class ChunkJob(Job):
+    """A chunk of a sequence; the model and its adapter are those of the whole."""
+
+    whole: SequenceJob
+    loop: bool = False
+
+    @cached_property
+    def model(self) -> ReconstructionModel:
+        """The model of the whole sequence."""
+        return self.whole.model
+
+    @cached_property
+    def in_place(self) -> Adapter | None:
+        """The adapter of the whole sequence."""
+        return self.whole.in_place
+
+    def make(self) -> Computed:
+        """Write the result of the chunk; an adapter that was trained is judged already."""
+        frozen = self.frozen() if self.recipe is not None and not self.loop else None
+        if frozen is not None and not self.whole.uses_adapter:
+            final = frozen
+        elif frozen is not None:
+            final, rejected = self._adapted_prediction(frozen)
+            if rejected is not None:
+                self._warn(f"{capital(rejected)} The frozen model's result is used for these frames.")
+        else:
+            if self.whole.uses_adapter:
+                assert self.in_place is not None
+            final = self._predicted(self.folder.path, "prediction")
+        result, about = self._result(final, frozen)
+        self.folder.note("placing", {**self._noted("placing"), **about})
+        return Computed(result=result, about=about)
