@@ -1,0 +1,1 @@
+"""Sequences of any length: chunks of frames that are predicted apart, aligned with each other and joined."""
