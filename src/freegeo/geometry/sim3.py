@@ -1,13 +1,17 @@
 """Similarity transforms, and the alignment of a predicted camera trajectory with a reference one."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from freegeo.errors import UserError
-from freegeo.geometry.rotation import rotate
+from freegeo.geometry.rotation import matrix_to_quat_xyzw, rotate
 from freegeo.geometry.se3 import camera_centres, from_Rt, to_4x4
 
 __all__ = ["CameraAlignment", "DegenerateAlignmentError", "Sim3", "align_cameras", "umeyama"]
@@ -44,14 +48,57 @@ class Sim3:
         centres = self.apply(camera_centres(T_cam_world))
         return from_Rt(R_cam_world, -(R_cam_world @ centres[..., None]).squeeze(-1))
 
-    def inverse(self) -> "Sim3":
+    def inverse(self) -> Sim3:
         """The transform from the reference back to the estimate."""
         scale = 1 / self.s
         return Sim3(s=scale, R=self.R.mT, t=-scale[..., None] * rotate(self.R.mT, self.t))
 
-    def to(self, dtype: torch.dtype) -> "Sim3":
+    def __matmul__(self, other: Sim3) -> Sim3:
+        """The transform that applies `other` first, then this one."""
+        return Sim3(s=self.s * other.s, R=self.R @ other.R, t=self.apply(other.t))
+
+    def __getitem__(self, index: int | Tensor) -> Sim3:
+        """One or several transforms of a stack, by an index of their first dimension."""
+        return Sim3(s=self.s[index], R=self.R[index], t=self.t[index])
+
+    def to(self, dtype: torch.dtype) -> Sim3:
         """The same transform in another floating type."""
         return Sim3(s=self.s.to(dtype), R=self.R.to(dtype), t=self.t.to(dtype))
+
+    def log(self) -> Tensor:
+        """Logarithm (..., 7): axis times angle (3), at most pi; linear part of the translation (3); log of the scale.
+
+        `Sim3.exp` is its inverse. ``S.inverse().log() == -S.log()``, but for half turns, whose axis has two signs.
+        """
+        quaternion = matrix_to_quat_xyzw(self.R)
+        vector, w = quaternion[..., :3], quaternion[..., 3]
+        sine = torch.linalg.vector_norm(vector, dim=-1)
+        # Half the angle over its sine, whose limit at 0 is 1; the quaternion has w >= 0.
+        ratio = torch.where(sine > 0, torch.atan2(sine, w) / sine.clamp(min=torch.finfo(sine.dtype).tiny), 1.0)
+        axis_angle, log_scale = 2 * ratio[..., None] * vector, self.s.log()
+        _, integral = _exponential(axis_angle, log_scale)
+        linear = torch.linalg.solve(integral, self.t[..., None]).squeeze(-1)
+        return torch.cat((axis_angle, linear, log_scale[..., None]), dim=-1)
+
+    @classmethod
+    def exp(cls, logarithm: Tensor) -> Sim3:
+        """The transform whose `log` is `logarithm` (..., 7); angles above pi are understood too."""
+        axis_angle, linear, log_scale = logarithm.split((3, 3, 1), dim=-1)
+        log_scale = log_scale.squeeze(-1)
+        turned, integral = _exponential(axis_angle, log_scale)
+        scale = log_scale.exp()
+        return cls(s=scale, R=turned / scale[..., None, None], t=(integral @ linear[..., None]).squeeze(-1))
+
+    @classmethod
+    def identity(cls, dtype: torch.dtype = torch.float64) -> Sim3:
+        """The transform that changes nothing."""
+        return cls(s=torch.ones((), dtype=dtype), R=torch.eye(3, dtype=dtype), t=torch.zeros(3, dtype=dtype))
+
+    @classmethod
+    def stack(cls, transforms: Sequence[Sim3]) -> Sim3:
+        """Several transforms as one, along a new first dimension."""
+        s, R, t = zip(*((each.s, each.R, each.t) for each in transforms), strict=True)
+        return cls(s=torch.stack(s), R=torch.stack(R), t=torch.stack(t))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,13 +111,20 @@ class CameraAlignment:
     inlier_threshold: float | None  # in the reference's units; None without RANSAC
 
 
-def umeyama(x: Tensor, y: Tensor, weights: Tensor | None = None) -> Sim3:
+ScaleRule = Literal["least-squares", "symmetric", "one"]
+"""How `umeyama` finds the scale."""
+
+
+def umeyama(x: Tensor, y: Tensor, weights: Tensor | None = None, *, scale: ScaleRule = "least-squares") -> Sim3:
     """Least-squares similarity ``y ~ s R x + t`` (Umeyama 1991, equations 34 to 43).
 
     Args:
         x: (..., N, 3) points to move.
         y: (..., N, 3) where they should land.
         weights: optional (..., N) non-negative weights.
+        scale: `least-squares` minimises ``|y - s R x - t|^2``; noise in `x` makes this scale too small. `symmetric`
+            minimises ``|y - s R x - t|^2 / s`` (Horn 1987): without bias where both sets are equally noisy relative to
+            their size, and exchanging them gives the inverse. `one`: a rigid transform, ``s = 1``.
 
     Returns:
         The transform, in the dtype of the inputs; computed in float64.
@@ -98,7 +152,13 @@ def umeyama(x: Tensor, y: Tensor, weights: Tensor | None = None) -> Sim3:
     signs = torch.ones_like(D)
     signs[..., 2] = torch.where(reflected, -1.0, 1.0)
     R = (U * signs[..., None, :]) @ Vh
-    s = (D * signs).sum(-1) / (weights * centred_x.square()).sum((-2, -1))
+    spread_x = (weights * centred_x.square()).sum((-2, -1))
+    if scale == "least-squares":
+        s = (D * signs).sum(-1) / spread_x
+    elif scale == "symmetric":
+        s = ((weights * centred_y.square()).sum((-2, -1)) / spread_x).sqrt()
+    else:
+        s = torch.ones_like(spread_x)
     t = mean_y - s[..., None] * rotate(R, mean_x)
     return Sim3(s=s, R=R, t=t).to(dtype)
 
@@ -158,6 +218,19 @@ def align_cameras(
     return CameraAlignment(
         sim3=fit.to(dtype), T_cam_world=aligned.to(dtype), inliers=inliers, inlier_threshold=threshold
     )
+
+
+def _exponential(axis_angle: Tensor, log_scale: Tensor) -> tuple[Tensor, Tensor]:
+    """``exp(A)`` and the integral of ``exp(a A)`` over a = 0..1, where ``A`` is the cross product plus the log scale.
+
+    Both (..., 3, 3) are blocks of one matrix exponential, which needs no series for small angles.
+    """
+    x, y, z = axis_angle.unbind(-1)
+    A = torch.stack((log_scale, -z, y, z, log_scale, -x, -y, x, log_scale), dim=-1).unflatten(-1, (3, 3))
+    eye = torch.eye(3, dtype=A.dtype, device=A.device).expand_as(A)
+    upper = torch.cat((A, eye), dim=-1)
+    both = torch.linalg.matrix_exp(torch.cat((upper, torch.zeros_like(upper)), dim=-2))
+    return both[..., :3, :3], both[..., :3, 3:]
 
 
 def _draw_subsets(count: int, size: int, iterations: int, seed: int) -> list[list[int]]:

@@ -1,0 +1,231 @@
+"""Where every chunk lies, from all seams together: a pose graph of similarities.
+
+docs/sequences.md, "Placing chunks", says what is minimised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from freegeo.errors import FreeGeoError
+from freegeo.geometry.sim3 import Sim3
+from freegeo.sequence.alignment import Seam
+
+__all__ = ["Edge", "Placed", "place"]
+
+KERNEL = 0.05
+"""Disagreement of a robust edge with the others that halves its weight."""
+_WIDE_KERNEL = 1.0
+_MOST_EVALUATIONS = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edge:
+    """A measured transform between two chunks."""
+
+    first: int
+    second: int
+    sim3: Sim3
+    """Maps points of `second` to `first`."""
+    weight: float
+    """How much it counts, above 0; the share of inliers of its seam."""
+    robust: bool
+    """It may be wrong (a loop), so that it loses its weight when the others contradict it."""
+    centre: Tensor
+    """Where (3,) it was measured, in the frame of `second`: disagreements are counted there."""
+    size: float
+    """Length in units of `second` that a shift is relative to, such as the median depth."""
+
+    @classmethod
+    def of(cls, first: int, second: int, seam: Seam, *, robust: bool = False) -> Edge:
+        """Return the edge of a seam between two chunks."""
+        return cls(
+            first=first,
+            second=second,
+            sim3=seam.sim3,
+            weight=seam.inliers,
+            robust=robust,
+            centre=seam.centre,
+            size=seam.depth,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placed:
+    """Where the chunks lie."""
+
+    sim3: list[Sim3]
+    """Maps points of each chunk to the first chunk of its piece, float64."""
+    pieces: list[list[int]]
+    """Chunks that edges connect, ascending; the pieces ordered by their first chunk."""
+    residuals: np.ndarray
+    """(edges,) how far each edge is from the result: length of the logarithm of the difference, in which a radian, a
+    shift by `Edge.size` and a factor of e count alike."""
+    trust: np.ndarray
+    """(edges,) weight, 0 to 1, that a robust edge kept; 1 for the others."""
+
+
+def place(count: int, edges: Sequence[Edge], *, fixed_scale: bool = False) -> Placed:
+    """Place chunks so that they agree with the edges between them.
+
+    The first chunk of each piece stays. Without a cycle the edges are chained exactly. Otherwise the sum over edges of
+    the squared logarithm of their difference from the result is minimised, with a Cauchy loss of each robust edge.
+
+    Args:
+        count: number of chunks.
+        edges: in any order, several between two chunks if need be.
+        fixed_scale: all scales are 1 and stay so.
+
+    Raises:
+        FreeGeoError: an edge of a chunk that does not exist or with itself, or without a positive weight and size.
+    """
+    for edge in edges:
+        if edge.first == edge.second or not (0 <= edge.first < count and 0 <= edge.second < count):
+            raise FreeGeoError(f"An edge between chunks {edge.first} and {edge.second} does not fit {count} chunks.")
+        if not (edge.weight > 0 and edge.size > 0):
+            raise FreeGeoError(f"The edge between chunks {edge.first} and {edge.second} has no weight or no size.")
+    placed, pieces = _chained(count, edges)
+    for piece in pieces:
+        own = [edge for edge in edges if edge.first in piece]
+        if len(own) >= len(piece):
+            moved = _refined([placed[chunk] for chunk in piece], _renumbered(own, piece), fixed_scale=fixed_scale)
+            for chunk, sim3 in zip(piece, moved, strict=True):
+                placed[chunk] = sim3
+    if not edges:
+        return Placed(sim3=placed, pieces=pieces, residuals=np.zeros(0), trust=np.ones(0))
+    graph = _Graph.of(edges)
+    lengths = torch.linalg.vector_norm(graph.differences(Sim3.stack(placed)), dim=-1)
+    trust = torch.where(graph.robust, 1 / (1 + graph.weight * (lengths / KERNEL).square()), 1.0)
+    return Placed(sim3=placed, pieces=pieces, residuals=lengths.numpy(), trust=trust.numpy())
+
+
+def _order(edge: Edge) -> tuple[bool, float, int, int]:
+    """Sort sure edges before robust ones and heavy before light ones."""
+    return edge.robust, -edge.weight, edge.first, edge.second
+
+
+def _chained(count: int, edges: Sequence[Edge]) -> tuple[list[Sim3], list[list[int]]]:
+    """Chain the edges of a maximum spanning tree (Kruskal) from the first chunk of each piece."""
+    piece_of = list(range(count))
+    neighbours: list[list[tuple[int, Sim3]]] = [[] for _ in range(count)]
+    for edge in sorted(edges, key=_order):
+        kept, joined = sorted((piece_of[edge.first], piece_of[edge.second]))
+        if kept != joined:
+            piece_of = [kept if piece == joined else piece for piece in piece_of]
+            neighbours[edge.first].append((edge.second, edge.sim3))
+            neighbours[edge.second].append((edge.first, edge.sim3.inverse()))
+    placed: dict[int, Sim3] = {}
+    for root in sorted(set(piece_of)):
+        placed[root] = Sim3.identity()
+        waiting = [root]
+        while waiting:
+            chunk = waiting.pop()
+            for other, sim3 in neighbours[chunk]:
+                if other not in placed:
+                    placed[other] = placed[chunk] @ sim3
+                    waiting.append(other)
+    pieces = [[chunk for chunk in range(count) if piece_of[chunk] == root] for root in sorted(set(piece_of))]
+    return [placed[chunk] for chunk in range(count)], pieces
+
+
+def _renumbered(edges: Sequence[Edge], piece: Sequence[int]) -> list[Edge]:
+    number = {chunk: i for i, chunk in enumerate(piece)}
+    return [replace(edge, first=number[edge.first], second=number[edge.second]) for edge in edges]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Graph:
+    """Edges as tensors (E, ...)."""
+
+    first: Tensor
+    second: Tensor
+    measured: Sim3
+    local: Sim3
+    """From coordinates about the place of measurement, of its size, to the frame of the second chunk."""
+    weight: Tensor
+    robust: Tensor
+
+    @classmethod
+    def of(cls, edges: Sequence[Edge]) -> _Graph:
+        eye = torch.eye(3, dtype=torch.float64)
+        return cls(
+            first=torch.tensor([edge.first for edge in edges]),
+            second=torch.tensor([edge.second for edge in edges]),
+            measured=Sim3.stack([edge.sim3.to(torch.float64) for edge in edges]),
+            local=Sim3(
+                s=torch.tensor([edge.size for edge in edges], dtype=torch.float64),
+                R=eye.expand(len(edges), 3, 3),
+                t=torch.stack([edge.centre.double() for edge in edges]),
+            ),
+            weight=torch.tensor([edge.weight for edge in edges], dtype=torch.float64),
+            robust=torch.tensor([edge.robust for edge in edges]),
+        )
+
+    def differences(self, placed: Sim3) -> Tensor:
+        """Logarithms (E, 7) of what each edge lacks to the result, about its place of measurement."""
+        between = placed[self.first].inverse() @ placed[self.second]
+        return (self.local.inverse() @ self.measured.inverse() @ between @ self.local).log()
+
+
+def _refined(start: Sequence[Sim3], edges: Sequence[Edge], *, fixed_scale: bool) -> list[Sim3]:
+    """Minimise the differences of the edges; the first of the placed chunks stays.
+
+    With robust edges there are several minima. The search starts from the chain, where a true loop can look wrong, and
+    from the minimum of a wide kernel, which every loop has pulled at; the lower of the two minima is taken.
+    """
+    from scipy.optimize import least_squares
+    from scipy.sparse import coo_array
+
+    graph, chain = _Graph.of(edges), Sim3.stack(start)
+    about = _local_frames(len(start), graph)
+    back, forth = about.inverse(), chain @ about
+    free = 6 if fixed_scale else 7
+    free_chunks = len(start) - 1
+
+    def placed(x: np.ndarray) -> Sim3:
+        steps = torch.zeros((len(start), 7), dtype=torch.float64)
+        steps[1:, :free] = torch.from_numpy(x).reshape(free_chunks, free)
+        return forth @ Sim3.exp(steps) @ back
+
+    def errors(x: np.ndarray, kernel: float) -> np.ndarray:
+        weighted = graph.weight.sqrt()[:, None] * graph.differences(placed(x))
+        square = weighted.square().sum(-1, keepdim=True).clamp(min=1e-300) / kernel**2
+        shrunk = (square.log1p() / square).sqrt() * weighted  # the square of its length is the Cauchy loss
+        return torch.where(graph.robust[:, None], shrunk, weighted).flatten().numpy()
+
+    ends = torch.stack((graph.first, graph.second), dim=1).numpy()
+    edge, end = np.nonzero(ends > 0)
+    rows = edge[:, None, None] * 7 + np.arange(7)[:, None] + np.zeros(free, int)
+    columns = (ends[edge, end] - 1)[:, None, None] * free + np.zeros((7, 1), int) + np.arange(free)
+    pattern = coo_array((np.ones(rows.size), (rows.ravel(), columns.ravel())), (len(edges) * 7, free_chunks * free))
+
+    def minimum(x: np.ndarray, kernel: float) -> tuple[float, np.ndarray]:
+        found = least_squares(
+            errors, x, jac_sparsity=pattern.tocsr(), args=(kernel,), ftol=1e-12, xtol=1e-10, gtol=1e-12,
+            max_nfev=_MOST_EVALUATIONS, tr_options={"regularize": False, "atol": 1e-12, "btol": 1e-12, "maxiter": 20 * x.size},
+        )  # fmt: skip
+        return float(found.cost), found.x
+
+    cost, best = minimum(np.zeros(free_chunks * free), KERNEL)
+    if bool(graph.robust.any()):
+        _, wide = minimum(np.zeros(free_chunks * free), _WIDE_KERNEL)
+        other_cost, other = minimum(wide, KERNEL)
+        best = other if other_cost < cost else best
+    moved = placed(best)
+    return [start[0], *(moved[chunk] for chunk in range(1, len(start)))]
+
+
+def _local_frames(count: int, graph: _Graph) -> Sim3:
+    """For each chunk, coordinates about a place where one of its edges was measured, in the size of that place."""
+    here = graph.measured @ graph.local
+    frames: dict[int, tuple[Tensor, Tensor]] = {}
+    for edge, (first, second) in enumerate(zip(graph.first.tolist(), graph.second.tolist(), strict=True)):
+        frames.setdefault(second, (graph.local.s[edge], graph.local.t[edge]))
+        frames.setdefault(first, (here.s[edge], here.t[edge]))
+    s, t = (torch.stack([frames[chunk][part] for chunk in range(count)]) for part in (0, 1))
+    return Sim3(s=s, R=torch.eye(3, dtype=torch.float64).expand(count, 3, 3), t=t)
