@@ -98,8 +98,8 @@ def run_step(step: str, folder: Path) -> None:
     end = time.perf_counter()
     stop.set()
     print(json.dumps({
-        "load_s": round(loaded - begin, 2), "wall_s": round(end - loaded, 2), "cpu_s": round(time.process_time() - cpu, 2),
-        "peak_mb": memory("VmHWM"), "own_mb": max(samples),
+        "load_s": round(loaded - begin, 2), "wall_s": round(end - loaded, 2),
+        "cpu_s": round(time.process_time() - cpu, 2), "peak_mb": memory("VmHWM"), "own_mb": max(samples),
     }))  # fmt: skip
 
 
