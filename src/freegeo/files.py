@@ -1,24 +1,32 @@
 """The one way into an output folder: atomic writes of files and folders, and the ledger of what was written there.
 
 A ledger in an output folder lists what freegeo wrote there, so that replacing a result never touches a file that
-somebody put beside it. Only the standard library is used here.
+somebody put beside it. NumPy is loaded by the functions that need it only.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import re
 import secrets
 import shutil
-from collections.abc import Generator, Iterable, Mapping
+import struct
+import zipfile
+import zlib
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.lock import LOCK_FILE, Lock, note_removed, note_written, require_lock, require_no_link
+
+if TYPE_CHECKING:
+    import numpy as np
 
 FORMAT = 1
 """Version of the files that freegeo writes."""
@@ -29,6 +37,10 @@ NAME_MAX = 255
 """Longest name of a file in bytes, on every common file system."""
 _SHOWN = 80
 """Most characters of an odd name that a message shows."""
+_LOCAL_HEADER, _ZIP64_FIELD = 30, 20
+"""Bytes of the header before a member of a zip file, without its name and extra fields, and of the field for sizes."""
+_PADDING_KIND, _ALIGNMENT = 0xD935, 64
+_BLOCK = 1 << 20
 _PART = re.compile(r"\..+\.[0-9a-f]{8}\.part(\..*)?")
 
 
@@ -306,6 +318,113 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 
     with atomic_path(path) as part:
         np.savez_compressed(part, **arrays)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """An array that is written in parts; FreeGeoError when these are not what was announced."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    parts: Iterable[np.ndarray]
+    """Arrays (n, ...) that follow each other along the first axis; each may be forgotten when it is written."""
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        """Yield the parts as they are written."""
+        import numpy as np
+
+        count = 0
+        for part in self.parts:
+            count += len(part)
+            if part.shape[1:] != self.shape[1:] or count > self.shape[0]:
+                raise FreeGeoError(f"rows of the shape {part.shape} do not fit an array of {self.shape}.")
+            yield np.ascontiguousarray(part, self.dtype)
+        if count != self.shape[0]:
+            raise FreeGeoError(f"{count} rows do not fill an array of the shape {self.shape}.")
+
+
+def write_npz_rows(path: Path, arrays: Iterable[tuple[str, np.ndarray | Rows]]) -> None:
+    """Write named NumPy arrays atomically and uncompressed, one part of `Rows` at a time; `read_npz` maps them."""
+    import numpy as np
+
+    with atomic_path(path) as part, part.open("wb") as file, zipfile.ZipFile(file, "w") as archive:
+        for name, value in arrays:
+            rows = value if isinstance(value, Rows) else Rows(shape=value.shape, dtype=value.dtype, parts=[value])
+            entry = zipfile.ZipInfo(f"{name}.npy")
+            entry.extra = _padding(file.tell(), entry)
+            header = {"descr": np.lib.format.dtype_to_descr(np.dtype(rows.dtype)), "fortran_order": False}
+            with archive.open(entry, "w", force_zip64=True) as stream:
+                np.lib.format.write_array_header_1_0(stream, {**header, "shape": rows.shape})
+                if rows.shape:
+                    for block in rows:
+                        stream.write(block.data if block.size else b"")
+                else:
+                    stream.write(np.asarray(value).tobytes())
+
+
+def _padding(start: int, entry: zipfile.ZipInfo) -> bytes:
+    """Extra field after which a member that starts at `start` has its content at a multiple of 64, as NumPy aligns it.
+
+    Its kind is the one that Android's zipalign uses for the same purpose.
+    """
+    before = start + _LOCAL_HEADER + len(entry.filename.encode()) + _ZIP64_FIELD + 4
+    return struct.pack("<HH", _PADDING_KIND, -before % _ALIGNMENT) + bytes(-before % _ALIGNMENT)
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of an .npz file, and map those that are stored in it uncompressed.
+
+    Mapped ones (`np.memmap`) are read when they are used and can be larger than memory; writing into them changes
+    neither the file nor what others read. All content is compared with its checksum here.
+
+    Raises:
+        FreeGeoError: the file is damaged.
+    """
+    import numpy as np
+
+    arrays: dict[str, np.ndarray] = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for entry in archive.infolist():
+                if entry.filename.endswith(".npy"):
+                    mapped = _mapped(path, archive, entry) if entry.compress_type == zipfile.ZIP_STORED else None
+                    if mapped is None:
+                        with archive.open(entry) as stream:
+                            mapped = np.lib.format.read_array(stream, allow_pickle=False)
+                    arrays[entry.filename.removesuffix(".npy")] = mapped
+    except (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, OSError) as error:
+        raise FreeGeoError(f"{path}: damaged file ({error}). Remove it and run again.") from None
+    return arrays
+
+
+def _mapped(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray | None:
+    """Return a stored member as an array in the file; None for what cannot be mapped, such as a single number.
+
+    ValueError, or BadZipFile, when it is damaged.
+    """
+    import numpy as np
+
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    with archive.open(entry) as stream:
+        version = np.lib.format.read_magic(stream)
+        if version not in read_header:
+            return None
+        shape, columns_first, dtype = read_header[version](stream)
+        header = stream.tell()
+        # The checksum is compared at the end.
+        while stream.read(_BLOCK):
+            pass
+    with path.open("rb") as file:
+        file.seek(entry.header_offset)
+        name, extra = struct.unpack("<HH", file.read(_LOCAL_HEADER)[-4:])
+    start = entry.header_offset + _LOCAL_HEADER + name + extra + header
+    size = math.prod(shape) * dtype.itemsize
+    # Without alignment computing on the array would be slow, or impossible.
+    if dtype.hasobject or not shape or min(shape) < 1 or start % dtype.alignment:
+        return None
+    if header + size > entry.file_size:
+        raise ValueError(f"{entry.filename} is too short")
+    return np.memmap(path, dtype, mode="c", offset=start, shape=shape, order="F" if columns_first else "C")
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:

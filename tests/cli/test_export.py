@@ -120,7 +120,7 @@ def test_commas_spaces_and_all(freegeo, out, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["-f"], "Choose from npz, ply, glb, mesh, colmap, nerfstudio, depth, or all"),
+        (["-f"], "Choose from npz, ply, glb, mesh, colmap, nerfstudio, tum, depth, or all"),
         (["-f", ","], "Choose from npz"),
         (["-f", "ply,obj"], "Unknown export format 'obj'. Choose from npz, ply"),
         ([], "--format"),

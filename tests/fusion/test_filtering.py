@@ -6,7 +6,7 @@ import torch
 
 from freegeo.data.procedural import render, sample_rooms
 from freegeo.errors import UserError
-from freegeo.fusion.agreement import look_up, nearest_views, prepare, vote
+from freegeo.fusion.agreement import Votes, look_up, nearest_views, prepare, vote
 from freegeo.fusion.filtering import confident_pixels, filter_pixels, flying_pixels
 from freegeo.fusion.settings import FilterSettings
 
@@ -56,6 +56,15 @@ def filtered(depth_z, T_cam_world, K, **options):
     return torch.from_numpy(keep), report
 
 
+def votes_on(depth_z, T_cam_world, K, tolerance):
+    """Votes on all views, (S, H, W), where all pixels are usable."""
+    everywhere = torch.ones_like(depth_z, dtype=torch.bool)
+    found = dict(vote(prepare(depth_z, T_cam_world, K, everywhere, tolerance=tolerance)))
+    assert sorted(found) == list(range(len(depth_z)))
+    names = ("agree", "contradict", "asked")
+    return Votes(**{n: torch.stack([getattr(found[view], n) for view in sorted(found)]) for n in names})
+
+
 def test_injected_flying_pixels_and_outliers_go_and_good_points_stay():
     lost = {GOOD: [], FLYING: [], OUTLIER: []}
     for seed in (0, 1, 7, 11):
@@ -82,9 +91,7 @@ def test_whole_patches_in_front_of_a_surface_are_outvoted_where_others_look():
     wrong, kind = spoiled(depth_z, 1, patches=True)
     keep, _ = filtered(wrong, T_cam_world, K)
     alone, _ = filtered(wrong, T_cam_world, K, settings=FilterSettings(multi_view=False))
-    looked_at = (
-        vote(prepare(depth_z, T_cam_world, K, torch.ones_like(kind, dtype=torch.bool), tolerance=0.02)).agree > 1
-    )
+    looked_at = votes_on(depth_z, T_cam_world, K, 0.02).agree > 1
     patch = (kind == PATCH) & looked_at
     assert patch.sum() > 300
     assert float(keep[patch].float().mean()) < 0.1
@@ -98,7 +105,7 @@ def test_votes_count_views_that_agree_and_that_see_through():
     K = torch.tensor([[40.0, 0, 14.5], [0, 40.0, 9.5], [0, 0, 1]]).repeat(3, 1, 1)
     T_cam_world = torch.eye(4).repeat(3, 1, 1)
     T_cam_world[:, 0, 3] = torch.tensor([0.0, -0.1, 0.1])
-    votes = vote(prepare(depth_z, T_cam_world, K, torch.ones_like(depth_z, dtype=torch.bool), tolerance=0.05))
+    votes = votes_on(depth_z, T_cam_world, K, 0.05)
     assert (votes.agree[0, 9:11, 14:16] == 0).all()
     assert (votes.contradict[0, 9:11, 14:16] >= 2).all()
     assert (votes.agree[0, 2:6, 10:20] == 2).all()
@@ -121,7 +128,7 @@ def test_what_only_one_view_sees_stays():
 
 def test_confirmation_can_be_demanded():
     depth_z, T_cam_world, K = rendered(7)
-    agree = vote(prepare(depth_z, T_cam_world, K, torch.ones_like(depth_z).bool(), tolerance=0.02)).agree
+    agree = votes_on(depth_z, T_cam_world, K, 0.02).agree
     demanded, _ = filtered(
         depth_z, T_cam_world, K, settings=FilterSettings(flying=False, min_agreeing=2, min_asked=0, tolerance=0.02)
     )

@@ -33,16 +33,17 @@ def write_depth(reconstruction: Reconstruction, folder: Path, *, keep: np.ndarra
     valid = reconstruction.valid_pixels()
     if keep is not None:
         valid &= keep
-    scale = float(depth[valid].max()) / LARGEST if valid.any() else 1.0
-    # At least 1 for a valid depth, since 0 means no depth.
-    values = np.where(valid, np.clip(np.rint(np.where(valid, depth, 0) / scale), 1, LARGEST), 0).astype(np.uint16)
+    largest = max((depth[view][one].max() for view, one in enumerate(valid) if one.any()), default=None)
+    scale = 1.0 if largest is None else float(largest) / LARGEST
     text = PngImagePlugin.PngInfo()
     text.add_text("depth_scale", repr(scale))
     maps = dict(zip(reconstruction.names, depth_names(reconstruction.names), strict=True))
     paths = [files.inside(folder, name) for name in maps.values()]
-    for path, view in zip(paths, values, strict=True):
+    for path, one, known in zip(paths, depth, valid, strict=True):
+        # At least 1 for a valid depth, since 0 means no depth.
+        values = np.where(known, np.clip(np.rint(np.where(known, one, 0) / scale), 1, LARGEST), 0).astype(np.uint16)
         with files.atomic_path(path) as part:
-            Image.fromarray(view).save(part, pnginfo=text, compress_level=1)
+            Image.fromarray(values).save(part, pnginfo=text, compress_level=1)
     files.write_json(
         folder / "depth.json",
         {"scale": scale, "lengths": reconstruction.lengths, "meaning": MEANING, "maps": maps},

@@ -15,7 +15,7 @@ import numpy as np
 
 from freegeo import files
 from freegeo.errors import FreeGeoError, LostFolderError, UserError
-from freegeo.export import colmap, depth_png, glb, mesh, nerfstudio, ply
+from freegeo.export import colmap, depth_png, glb, mesh, nerfstudio, ply, tum
 from freegeo.export import reconstruction as npz
 from freegeo.export.base import MAX_TRACKS, Export, Exported, Format
 from freegeo.fusion.settings import MAX_POINTS, FilterSettings
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_MODULES = (npz, ply, glb, mesh, colmap, nerfstudio, depth_png)
+_MODULES = (npz, ply, glb, mesh, colmap, nerfstudio, tum, depth_png)
 FORMATS: dict[str, Format] = {module.FORMAT.name: module.FORMAT for module in _MODULES}
 ALL = "all"
 """Name that selects every format."""

@@ -38,10 +38,14 @@ def voxel_size(reconstruction: Reconstruction, keep: np.ndarray) -> float:
     """
     if not keep.any():
         raise FreeGeoError("No depth is left for a mesh. Lower the confidence limit or switch filters off.")
+    from freegeo.fusion.quantile import median, quantile
+
     K = reconstruction.cameras()[1]
-    covered = reconstruction.depth_z / np.sqrt(K[:, 0, 0] * K[:, 1, 1])[:, None, None]
-    extent = 2 * np.quantile(reconstruction.depth_z[keep], 0.98)
-    return float(max(VOXELS_PER_PIXEL * np.median(covered[keep]), extent / MAX_VOXELS_ACROSS))
+    focal = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
+    views = range(len(reconstruction))
+    covered = median(lambda: (reconstruction.depth_z[view][keep[view]] / focal[view] for view in views))
+    extent = 2 * quantile(lambda: (reconstruction.depth_z[view][keep[view]] for view in views), 0.98)
+    return float(max(VOXELS_PER_PIXEL * covered, extent / MAX_VOXELS_ACROSS))
 
 
 def fuse(reconstruction: Reconstruction, keep: np.ndarray, *, voxel: float) -> Mesh:
@@ -52,9 +56,9 @@ def fuse(reconstruction: Reconstruction, keep: np.ndarray, *, voxel: float) -> M
 
     T_cam_world, K = (torch.from_numpy(a).float() for a in reconstruction.cameras())
     volume = TsdfVolume(voxel=voxel, truncation=TRUNCATION_VOXELS * voxel)
-    depth = torch.from_numpy(np.where(keep, reconstruction.depth_z, 0))
     for view in range(len(reconstruction)):
-        volume.integrate(depth[view], K[view], T_cam_world[view])
+        depth = torch.from_numpy(np.where(keep[view], reconstruction.depth_z[view], 0))
+        volume.integrate(depth, K[view], T_cam_world[view])
     return volume.extract_mesh()
 
 

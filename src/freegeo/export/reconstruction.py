@@ -21,10 +21,9 @@ The keys are field names and must not change, because scripts of users read them
 from __future__ import annotations
 
 import math
-import zipfile
-import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -164,7 +163,10 @@ class Reconstruction:
 
     def valid_pixels(self) -> np.ndarray:
         """Mask (S, H, W) bool of usable depth: finite, positive, and not in padding."""
-        return np.isfinite(self.depth_z) & (self.depth_z > 0) & self.inside()
+        valid = self.inside()
+        for view, depth in enumerate(self.depth_z):
+            valid[view] &= np.isfinite(depth) & (depth > 0)
+        return valid
 
     def photo_K(self) -> np.ndarray:
         """Intrinsics (S, 3, 3) float64 of the original photos, pixel centres at whole numbers.
@@ -244,9 +246,15 @@ class Reconstruction:
         return {**arrays, **scale, "format": np.array(VERSION, np.int64)}
 
     def save(self, path: Path | str) -> Path:
-        """Write the file (`prediction.npz` of `path` when that is a folder) atomically; returns where it is."""
+        """Write the file (`prediction.npz` of `path` when that is a folder) atomically; returns where it is.
+
+        It is compressed; one whose depth is mapped from a file is written uncompressed, as that file is.
+        """
         file = _file(path)
-        files.write_npz(file, self.arrays())
+        if isinstance(self.depth_z, np.memmap):
+            files.write_npz_rows(file, self.arrays().items())
+        else:
+            files.write_npz(file, self.arrays())
         return file
 
     def export(
@@ -295,7 +303,10 @@ class Reconstruction:
 
     @classmethod
     def load(cls, path: Path | str) -> Reconstruction:
-        """Read what `save` wrote, from the file or the folder it is in.
+        """Read what `save` or `save_streamed` wrote, from the file or the folder it is in.
+
+        Arrays that the file stores uncompressed are mapped: they take memory as they are read, and can be larger than
+        it. Writing into them does not change the file.
 
         Raises:
             UserError: there is no such file, or a newer freegeo wrote it.
@@ -306,12 +317,7 @@ class Reconstruction:
             raise UserError(
                 f"{path}: holds no reconstruction ({FILE_NAME} is missing). Run `freegeo reconstruct` first."
             )
-        try:
-            with np.load(file, allow_pickle=False) as content:
-                arrays = {name: content[name] for name in content.files}
-        except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError) as error:
-            raise FreeGeoError(f"{file}: damaged file ({error}). Remove it and run again.") from None
-        return cls._from_arrays(arrays, file)
+        return cls._from_arrays(files.read_npz(file), file)
 
     @classmethod
     def _from_arrays(cls, arrays: dict[str, np.ndarray], file: Path) -> Reconstruction:
@@ -324,11 +330,69 @@ class Reconstruction:
             raise FreeGeoError(f"{file}: not a reconstruction, {', '.join(missing)} missing. Name another file.")
         kept = {name: np.float64 for name in _CAMERAS if name in arrays and arrays[name].dtype == np.float64}
         types = {**_DTYPES, **kept}
-        values = {n: arrays[n].astype(types.get(n, np.float32)) for n in names if n in arrays and n != "names"}
+        values = {
+            n: arrays[n].astype(types.get(n, np.float32), copy=False) for n in names if n in arrays and n != "names"
+        }
         try:
             return cls(**values, names=tuple(map(str, arrays["names"])), scale=Scale.from_arrays(arrays))
         except (FreeGeoError, ValueError) as error:
             raise FreeGeoError(f"{file}: not a reconstruction ({error}) Name another file.") from None
+
+
+def save_streamed(
+    path: Path | str,
+    *,
+    names: Sequence[str],
+    photo_hw: np.ndarray,
+    scale_xy: np.ndarray,
+    offset_xy: np.ndarray,
+    blocks: Callable[[str], Iterator[np.ndarray] | None],
+    T_cam_world: np.ndarray | None = None,
+    K: np.ndarray | None = None,
+    scale: Scale | None = None,
+) -> Path:
+    """Write the file of a reconstruction that is larger than memory, uncompressed and atomically; returns where it is.
+
+    Args:
+        path: of the file, or of the folder for `prediction.npz`.
+        names: of the S photos.
+        photo_hw: as the field of `Reconstruction`, like the next ones.
+        scale_xy: (S, 2).
+        offset_xy: (S, 2).
+        blocks: called once each with `depth_z`, `conf`, `images` and `sky`, one after the other; yields the rows of
+            that field in arrays (n, H, W[, 3]), in the order of the views. None for `sky` when there is none.
+        T_cam_world: (S, 4, 4).
+        K: (S, 3, 3).
+        scale: of the lengths.
+
+    Raises:
+        FreeGeoError: rows of another number or shape than the rest; no file is left then.
+        UserError: the folder cannot be written to.
+    """
+    rows = iter(blocks("depth_z") or ())
+    first = next(rows, np.zeros((0, 0, 0), np.float32))
+    shape = (len(names), *first.shape[1:])
+    # Zeros without memory stand for what is not there yet: the rest is checked against them, and put into order.
+    zeros = np.broadcast_to(np.float32(0), shape)
+    planned = Reconstruction(
+        depth_z=zeros, conf=zeros, images=np.broadcast_to(np.uint8(0), (*shape, 3)), names=tuple(names),
+        photo_hw=photo_hw, scale_xy=scale_xy, offset_xy=offset_xy, T_cam_world=T_cam_world, K=K, scale=scale,
+    )  # fmt: skip
+
+    def entries() -> Iterator[tuple[str, np.ndarray | files.Rows]]:
+        for name, value in planned.arrays().items():
+            if name in ("depth_z", "conf", "images"):
+                parts = chain([first], rows) if name == "depth_z" else blocks(name) or ()
+                yield name, files.Rows(shape=value.shape, dtype=value.dtype, parts=parts)
+            else:
+                yield name, value
+        sky = blocks("sky")
+        if sky is not None:
+            yield "sky", files.Rows(shape=shape, dtype=zeros.dtype, parts=sky)
+
+    file = _file(path)
+    files.write_npz_rows(file, entries())
+    return file
 
 
 def open_reconstruction(path: Path | str) -> Reconstruction:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from freegeo.fusion.quantile import quantile
 from freegeo.geometry.reproject import reproject
 from freegeo.geometry.se3 import camera_centres
 
 __all__ = [
     "Lookup",
+    "Surface",
     "Surfaces",
     "Votes",
     "look_up",
@@ -25,6 +30,8 @@ __all__ = [
 
 MAX_NEIGHBOURS = 6
 """Other views that a view's pixels are compared with."""
+PREPARED = 32
+"""Views whose prepared pixels are kept; neighbours in a sequence meet again within so many."""
 TOLERANCE_RANGE = (0.02, 0.15)
 """Range of the tolerance that `tolerance_of` estimates."""
 _QUANTILE, _SPREAD = 0.25, 8.0
@@ -34,7 +41,7 @@ _LARGEST_SLOPE = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class Votes:
-    """Votes on every pixel, (S, H, W) int16; a view votes only if the pixel's point falls into its image."""
+    """Votes on every pixel of a view, (H, W) int16; a view votes only if the pixel's point falls into its image."""
 
     agree: Tensor
     """Other views whose surface lies where this pixel's does."""
@@ -45,19 +52,28 @@ class Votes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Surfaces:
-    """The usable pixels of S views, prepared for `look_up`."""
+class Surface:
+    """The usable pixels of one view, prepared for `look_up`."""
 
     depth_z: Tensor
-    """(S, H, W); NaN where not usable."""
+    """(H, W); NaN where not usable."""
+    allowed: Tensor
+    """(H, W) relative depth difference that counts as the same surface: the tolerance and the slope."""
+    barrier: Tensor
+    """(H + 1, W + 1) depth before which a point between four pixels floats in front of all of their surfaces."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surfaces:
+    """The usable pixels of S views, for `look_up`."""
+
+    of: Callable[[int], Surface]
+    """Prepares a view when it is asked for; the latest `PREPARED` are kept."""
+    image_hw: tuple[int, int]
     T_cam_world: Tensor
     """(S, 4, 4)."""
     K: Tensor
     """(S, 3, 3)."""
-    allowed: Tensor
-    """(S, H, W) relative depth difference that counts as the same surface: the tolerance and the slope."""
-    barrier: Tensor
-    """(S, H + 1, W + 1) depth before which a point between four pixels floats in front of all of their surfaces."""
     inside: Tensor | None
     """(S, H, W) bool: false where the image is padding; None: no padding."""
 
@@ -91,25 +107,25 @@ def prepare(
 ) -> Surfaces:
     """Prepare depth maps (S, H, W) for comparisons with a relative `tolerance`; only `usable` pixels take part.
 
+    Maps and masks are read view by view, as the comparisons need them, so they must not change before the last one.
     `inside` (S, H, W) is false where an image is padding, which does not count as a place that its view looks at.
     """
-    known = torch.where(usable, depth_z, torch.nan)
-    allowed = tolerance + relative_slope(known)
-    front = torch.nn.functional.pad((known / (1 + allowed)).nan_to_num(torch.inf), (1, 1, 1, 1), value=torch.inf)
-    barrier = -torch.nn.functional.max_pool2d(-front[:, None], 2, stride=1)[:, 0]
-    # Where none of the four pixels is usable, a barrier of 0 contradicts nothing.
-    return Surfaces(
-        depth_z=known,
-        T_cam_world=T_cam_world,
-        K=K,
-        allowed=allowed,
-        barrier=torch.where(barrier.isinf(), 0.0, barrier),
-        inside=inside,
-    )
+
+    @lru_cache(maxsize=PREPARED)
+    def of(view: int) -> Surface:
+        known = torch.where(usable[view], depth_z[view], torch.nan)
+        allowed = tolerance + relative_slope(known)
+        front = torch.nn.functional.pad((known / (1 + allowed)).nan_to_num(torch.inf), (1, 1, 1, 1), value=torch.inf)
+        barrier = -torch.nn.functional.max_pool2d(-front[None], 2, stride=1)[0]
+        # Where none of the four pixels is usable, a barrier of 0 contradicts nothing.
+        return Surface(depth_z=known, allowed=allowed, barrier=torch.where(barrier.isinf(), 0.0, barrier))
+
+    height, width = depth_z.shape[1:]
+    return Surfaces(of=of, image_hw=(height, width), T_cam_world=T_cam_world, K=K, inside=inside)
 
 
-def vote(surfaces: Surfaces, neighbours: Tensor | None = None) -> Votes:
-    """Let the views vote on each other's usable pixels.
+def vote(surfaces: Surfaces, neighbours: Tensor | None = None) -> Iterator[tuple[int, Votes]]:
+    """Let the views vote on each other's usable pixels; yields each view and the votes on it when they are complete.
 
     A pixel's point is carried into another view. If that view has a surface there, it agrees; if it sees farther, one
     of the two pixels is wrong, and both get a contradiction; if it sees something nearer, the point is hidden and gets
@@ -117,32 +133,57 @@ def vote(surfaces: Surfaces, neighbours: Tensor | None = None) -> Votes:
     """
     if neighbours is None:
         neighbours = nearest_views(surfaces.T_cam_world)
-    depth_z = surfaces.depth_z
-    agree = torch.zeros(depth_z.shape, dtype=torch.int16, device=depth_z.device)
-    contradict, asked = torch.zeros_like(agree), torch.zeros_like(agree)
-    for source, others in enumerate(neighbours.tolist()):
-        for target in others:
+    others = neighbours.tolist()
+    waiting = Counter(view for source, targets in enumerate(others) for view in (source, *targets))
+    open_votes: dict[int, Votes] = {}
+
+    def votes_on(view: int) -> Votes:
+        if view not in open_votes:
+            agree, contradict, asked = torch.zeros((3, *surfaces.image_hw), dtype=torch.int16, device=surfaces.K.device)
+            open_votes[view] = Votes(agree=agree, contradict=contradict, asked=asked)
+        return open_votes[view]
+
+    for source in _close_together(others):
+        own = votes_on(source)
+        for target in others[source]:
             seen = look_up(surfaces, source, target)
-            asked[source] += seen.asked
-            agree[source] += seen.agrees
-            contradict[source] += seen.sees_through
+            own.asked.add_(seen.asked)
+            own.agree.add_(seen.agrees)
+            own.contradict.add_(seen.sees_through)
             # One vote per pair of views and pixel, however many points land on it.
-            hit = torch.zeros(depth_z[0].numel(), dtype=torch.bool, device=depth_z.device)
-            hit[seen.nearest[seen.sees_through]] = True
-            contradict[target] += hit.view(depth_z.shape[1:])
-    return Votes(agree=agree, contradict=contradict, asked=asked)
+            hit = torch.zeros_like(own.asked, dtype=torch.bool)
+            hit.view(-1)[seen.nearest[seen.sees_through]] = True
+            votes_on(target).contradict.add_(hit)
+        for view in (source, *others[source]):
+            waiting[view] -= 1
+            if not waiting[view]:
+                yield view, open_votes.pop(view)
+
+
+def _close_together(others: list[list[int]]) -> list[int]:
+    """Order of views in which those that are compared with each other are close, so that few votes stay open."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    pairs = [(source, target) for source, targets in enumerate(others) for target in targets]
+    if not pairs:
+        return list(range(len(others)))
+    rows, columns = np.array(pairs).T
+    graph = coo_array((np.ones(len(pairs)), (rows, columns)), shape=(len(others), len(others))).tocsr()
+    return reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).tolist()
 
 
 def look_up(surfaces: Surfaces, source: int, target: int) -> Lookup:
     """Compare the usable pixels of view `source` with the depth of view `target`."""
-    height, width = surfaces.depth_z.shape[1:]
+    width = surfaces.image_hw[1]
+    surface = surfaces.of(target)
     there = reproject(
-        surfaces.depth_z[source],
+        surfaces.of(source).depth_z,
         K_source=surfaces.K[source],
         T_source_world=surfaces.T_cam_world[source],
         K_target=surfaces.K[target],
         T_target_world=surfaces.T_cam_world[target],
-        target_hw=(height, width),
+        target_hw=surfaces.image_hw,
     )
     asked = there.in_view
     pixel = torch.where(asked[..., None], there.pixel, 0.0)
@@ -150,14 +191,14 @@ def look_up(surfaces: Surfaces, source: int, target: int) -> Lookup:
     nearest = row * width + column
     if surfaces.inside is not None:
         asked = asked & surfaces.inside[target].flatten()[nearest]
-    difference = surfaces.depth_z[target].flatten()[nearest] / there.depth_z - 1
+    difference = surface.depth_z.flatten()[nearest] / there.depth_z - 1
     difference = torch.where(asked, difference, torch.nan)
     # The barrier between the pixels (u, v) and (u + 1, v + 1) has the index (u + 1, v + 1).
     after = (pixel.floor() + 1).long()
-    barrier = surfaces.barrier[target].flatten()[after[..., 1] * (width + 1) + after[..., 0]]
+    barrier = surface.barrier.flatten()[after[..., 1] * (width + 1) + after[..., 0]]
     return Lookup(
         asked=asked,
-        agrees=difference.abs() <= surfaces.allowed[target].flatten()[nearest],  # false for NaN
+        agrees=difference.abs() <= surface.allowed.flatten()[nearest],  # false for NaN
         sees_through=asked & (there.depth_z < barrier),
         nearest=nearest,
         pixel=pixel,
@@ -166,9 +207,9 @@ def look_up(surfaces: Surfaces, source: int, target: int) -> Lookup:
 
 
 def relative_slope(depth_z: Tensor) -> Tensor:
-    """Relative depth change (S, H, W) to the next pixel, at most 0.2: the flatter side of each axis, both axes added.
+    """Relative depth change (..., H, W) to the next pixel, at most .2: the flatter side of each axis, both axes added.
 
-    `depth_z` (S, H, W) holds NaN where it is not known; the slope is 0 there.
+    `depth_z` (..., H, W) holds NaN where it is not known; the slope is 0 there.
     """
     total = torch.zeros_like(depth_z)
     for dim in (-1, -2):
@@ -199,13 +240,14 @@ def tolerance_of(depth_z: Tensor, T_cam_world: Tensor, K: Tensor, usable: Tensor
     lower bound; a network whose views disagree by some per cent is not filtered to nothing.
     """
     surfaces = prepare(depth_z, T_cam_world, K, usable, tolerance=0.0)
-    found = []
-    for source, others in enumerate(nearest_views(T_cam_world, _TOLERANCE_NEIGHBOURS).tolist()):
-        for target in others:
-            difference = look_up(surfaces, source, target).difference.abs()
-            found.append(difference[~difference.isnan()])
-    differences = torch.cat(found) if found else depth_z.new_zeros(0)
-    if differences.numel() == 0:
-        return TOLERANCE_RANGE[0]
+    others = nearest_views(T_cam_world, _TOLERANCE_NEIGHBOURS).tolist()
+
+    def differences() -> Iterator[np.ndarray]:
+        for source, targets in enumerate(others):
+            for target in targets:
+                difference = look_up(surfaces, source, target).difference.abs()
+                yield difference[~difference.isnan()].cpu().numpy()
+
+    quartile = float(quantile(differences, _QUANTILE))
     low, high = TOLERANCE_RANGE
-    return min(max(_SPREAD * float(np.quantile(differences.cpu().numpy(), _QUANTILE)), low), high)
+    return low if np.isnan(quartile) else min(max(_SPREAD * quartile, low), high)

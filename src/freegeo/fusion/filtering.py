@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from freegeo.errors import UserError
 from freegeo.fusion.agreement import prepare, tolerance_of, vote
+from freegeo.fusion.quantile import quantile
 from freegeo.fusion.settings import FilterSettings
 from freegeo.geometry.depth import valid_depth
 
@@ -77,38 +78,48 @@ def filter_pixels(
         UserError: masks of another shape.
     """
     settings = settings or FilterSettings()
-    depth, T, intrinsics = (torch.from_numpy(np.ascontiguousarray(a)).float() for a in (depth_z, T_cam_world, K))
     if masks is not None and masks.shape != depth_z.shape:
         raise UserError(f"Masks of the shape {masks.shape} do not fit depth maps of the shape {depth_z.shape}.")
+    # Arrays of floats, which may be mapped from a file larger than memory, are read view by view; masks are held.
+    depth, T, intrinsics = (_tensor(a).float() for a in (depth_z, T_cam_world, K))
     keep = torch.ones(depth.shape, dtype=torch.bool)
-    padded = inside is not None and not inside.all()
-    within = torch.from_numpy(np.ascontiguousarray(inside)) if padded else keep
-    depth = torch.where(within, depth, torch.nan)
+    within = _tensor(inside) if inside is not None and not inside.all() else None
     removed: dict[str, int] = {}
 
-    def apply(name: str, passed: Tensor) -> None:
-        nonlocal keep
-        before = int(keep.sum())
-        keep = keep & passed
-        removed[name] = before - int(keep.sum())
+    def apply(name: str, passed: Callable[[int], Tensor]) -> None:
+        removed[name] = 0
+        for view, kept in enumerate(keep):
+            gone = kept & ~passed(view)
+            removed[name] += int(gone.sum())
+            kept &= ~gone
 
-    if padded:
-        apply("outside the photo", within)
-    apply("invalid depth", valid_depth(depth))
+    def known(view: int) -> Tensor:
+        return depth[view] if within is None else torch.where(within[view], depth[view], torch.nan)
+
+    if within is not None:
+        apply("outside the photo", lambda view: within[view])
+    apply("invalid depth", lambda view: valid_depth(known(view)))
     if masks is not None:
-        apply("mask", torch.from_numpy(np.ascontiguousarray(masks)).bool())
+        wanted = _tensor(masks)
+        apply("mask", lambda view: wanted[view].bool())
     if sky is not None and settings.sky_limit <= 1:
-        apply("sky", torch.from_numpy(np.ascontiguousarray(sky)) < settings.sky_limit)
+        seen = _tensor(sky)
+        apply("sky", lambda view: seen[view] < settings.sky_limit)
     if settings.drop_share > 0:
-        confidence = torch.from_numpy(np.ascontiguousarray(conf))
-        apply("confidence", confident_pixels(confidence, keep, drop_share=settings.drop_share))
+        confident = confident_pixels(_tensor(conf), keep, drop_share=settings.drop_share)
+        apply("confidence", lambda view: confident[view])
     if settings.flying:
-        apply("flying", ~flying_pixels(depth, intrinsics))
+        apply("flying", lambda view: ~flying_pixels(known(view)[None], intrinsics[view : view + 1])[0])
     tolerance = None
     if settings.multi_view and len(depth) > 1:
         tolerance = settings.tolerance or tolerance_of(depth, T, intrinsics, keep)
-        apply("multi-view", _confirmed(depth, T, intrinsics, keep, within, tolerance, settings))
+        confirmed = _confirmed(depth, T, intrinsics, keep, within, tolerance, settings)
+        apply("multi-view", lambda view: confirmed[view])
     return keep.numpy(), FilterReport(pixels=depth.numel(), removed=removed, tolerance=tolerance)
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array))
 
 
 def _confirmed(
@@ -116,7 +127,7 @@ def _confirmed(
     T_cam_world: Tensor,
     K: Tensor,
     usable: Tensor,
-    inside: Tensor,
+    inside: Tensor | None,
     tolerance: float,
     settings: FilterSettings,
 ) -> Tensor:
@@ -125,24 +136,33 @@ def _confirmed(
     A contradiction counts against both pixels involved, so clear cases (two votes more against than for) are removed
     first, and the votes on the rest are counted without them.
     """
-    votes = vote(prepare(depth_z, T_cam_world, K, usable, tolerance=tolerance, inside=inside))
-    usable = usable & (votes.contradict - votes.agree < 2)
-    votes = vote(prepare(depth_z, T_cam_world, K, usable, tolerance=tolerance, inside=inside))
-    silent = (votes.agree < settings.min_agreeing) & (votes.asked >= settings.min_asked)
-    return usable & (votes.contradict <= votes.agree) & ~silent
+    likely = torch.empty_like(usable)
+    for view, votes in vote(prepare(depth_z, T_cam_world, K, usable, tolerance=tolerance, inside=inside)):
+        likely[view] = usable[view] & (votes.contradict - votes.agree < 2)
+    confirmed = torch.empty_like(usable)
+    for view, votes in vote(prepare(depth_z, T_cam_world, K, likely, tolerance=tolerance, inside=inside)):
+        silent = (votes.agree < settings.min_agreeing) & (votes.asked >= settings.min_asked)
+        confirmed[view] = likely[view] & (votes.contradict <= votes.agree) & ~silent
+    return confirmed
 
 
 def confident_pixels(conf: Tensor, usable: Tensor, *, drop_share: float) -> Tensor:
-    """Mask (...) of the `usable` pixels without the least confident `drop_share` of them (over all views together).
+    """Mask (S, H, W) of the `usable` pixels without the least confident `drop_share` of them (over all views together).
 
     Pixels as confident as the threshold stay, so a constant confidence drops nothing.
     """
-    values = conf[usable]
-    if drop_share <= 0 or values.numel() == 0:
+    if drop_share <= 0:
         return usable.clone()
-    # NumPy, because torch.quantile is limited to 16 million values.
-    threshold = float(np.quantile(values.detach().cpu().numpy(), drop_share, method="lower"))
-    return usable & (conf >= threshold)
+
+    def values() -> Iterator[np.ndarray]:
+        for view, one in enumerate(usable):
+            yield conf[view][one].detach().cpu().numpy()
+
+    threshold = float(quantile(values, drop_share, method="lower"))
+    confident = torch.empty_like(usable)
+    for view, one in enumerate(usable):
+        confident[view] = one & (conf[view] >= threshold)
+    return confident
 
 
 def flying_pixels(depth_z: Tensor, K: Tensor) -> Tensor:

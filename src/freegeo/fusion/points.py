@@ -12,7 +12,7 @@ from freegeo.fusion.filtering import confident_pixels, flying_pixels
 from freegeo.fusion.settings import DROP_SHARE, MAX_POINTS
 from freegeo.geometry.depth import depth_to_world, valid_depth
 
-__all__ = ["PointCloud", "coloured_points", "thin_points"]
+__all__ = ["PointCloud", "coloured_points", "thin_pixels", "thin_points"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,19 +77,27 @@ def coloured_points(
     """
     if not 0 <= drop_share < 1:
         raise UserError(f"The share of points to drop must be from 0 to below 1, got {drop_share}.")
-    depth = torch.from_numpy(np.ascontiguousarray(depth_z)).float()
-    K_tensor = torch.from_numpy(np.ascontiguousarray(K)).float()
-    usable = valid_depth(depth)
-    if keep is not None:
-        usable &= torch.from_numpy(keep)
-    if drop_flying:
-        usable &= ~flying_pixels(depth, K_tensor)
+    depth, K_tensor, T = (torch.from_numpy(np.ascontiguousarray(a)).float() for a in (depth_z, K, T_cam_world))
+    usable = torch.empty(depth.shape, dtype=torch.bool)
+    for view in range(len(depth)):
+        usable[view] = valid_depth(depth[view])
+        if keep is not None:
+            usable[view] &= torch.from_numpy(keep[view])
+        if drop_flying:
+            usable[view] &= ~flying_pixels(depth[view : view + 1], K_tensor[view : view + 1])[0]
     usable = confident_pixels(torch.from_numpy(np.ascontiguousarray(conf)), usable, drop_share=drop_share)
-    index = thin_points(torch.nonzero(usable.flatten())[:, 0].numpy(), max_points=max_points, seed=seed)
-    world = depth_to_world(depth, K_tensor, torch.from_numpy(np.ascontiguousarray(T_cam_world)).float())
+    index = thin_pixels(usable.numpy(), max_points=max_points, seed=seed)
     view, row, column = np.unravel_index(index, depth_z.shape)
+    ends = np.searchsorted(view, np.arange(len(depth)), side="right").tolist()
+    points = np.empty((len(index), 3), np.float32)
+    start = 0
+    for one, end in enumerate(ends):
+        if end > start:
+            world = depth_to_world(depth[one : one + 1], K_tensor[one : one + 1], T[one : one + 1])[0].numpy()
+            points[start:end] = world[row[start:end], column[start:end]]
+        start = end
     return PointCloud(
-        points=world.flatten(0, 2).numpy()[index],
+        points=points,
         colours=images.reshape(-1, 3)[index],
         conf=conf.reshape(-1)[index].astype(np.float32),
         view=view,
@@ -99,9 +107,33 @@ def coloured_points(
 
 def thin_points(index: np.ndarray, *, max_points: int | None, seed: int) -> np.ndarray:
     """Return at most `max_points` of `index` (n,), a seeded choice in the order given; UserError for less than 1."""
+    chosen = _chosen(len(index), max_points, seed)
+    return index if chosen is None else index[chosen]
+
+
+def thin_pixels(keep: np.ndarray, *, max_points: int | None, seed: int) -> np.ndarray:
+    """Return flat indices (n,) int64 of at most `max_points` kept pixels of masks (S, H, W), as `thin_points` chooses.
+
+    The choice depends on the number of kept pixels alone, so no list of all of them is made.
+    """
+    counts = [int(np.count_nonzero(one)) for one in keep]
+    chosen = _chosen(sum(counts), max_points, seed)
+    if chosen is None:
+        return np.flatnonzero(keep)
+    ends = np.cumsum(counts)
+    parts = np.split(chosen, np.searchsorted(chosen, ends))
+    found = [
+        np.flatnonzero(keep[view])[part - (ends[view] - counts[view])] + view * keep[view].size
+        for view, part in enumerate(parts[: len(keep)])
+        if len(part)
+    ]
+    return np.concatenate([np.zeros(0, np.int64), *found])
+
+
+def _chosen(count: int, max_points: int | None, seed: int) -> np.ndarray | None:
+    """Return sorted numbers of at most `max_points` of `count` things; None: all of them."""
     if max_points is not None and max_points < 1:
         raise UserError(f"The number of points must be at least 1, got {max_points}.")
-    if max_points is None or len(index) <= max_points:
-        return index
-    chosen = np.random.default_rng(seed).choice(len(index), size=max_points, replace=False, shuffle=False)
-    return index[np.sort(chosen)]
+    if max_points is None or count <= max_points:
+        return None
+    return np.sort(np.random.default_rng(seed).choice(count, size=max_points, replace=False, shuffle=False))

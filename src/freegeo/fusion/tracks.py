@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from freegeo.fusion.agreement import Lookup, Surfaces, look_up, nearest_views, prepare
-from freegeo.fusion.points import thin_points
+from freegeo.fusion.points import thin_pixels, thin_points
 from freegeo.geometry.camera import project
 from freegeo.geometry.se3 import inverse, transform_points
 
@@ -89,10 +89,9 @@ def build_tracks(
 
 
 def _candidates(keep: np.ndarray, max_points: int | None, seed: int) -> Tensor:
-    index = np.flatnonzero(keep)
     limit = None if max_points is None else _CANDIDATES_PER_POINT * max_points
     chosen = np.zeros(keep.size, dtype=bool)
-    chosen[thin_points(index, max_points=limit, seed=seed)] = True
+    chosen[thin_pixels(keep, max_points=limit, seed=seed)] = True
     return torch.from_numpy(chosen.reshape(keep.shape))
 
 
@@ -107,9 +106,9 @@ def _tracks_of(
     max_error: float,
 ) -> Tracks:
     """Tracks that start at the pixels `starts` (n,) of view `source`, numbered from `first`."""
-    width = surfaces.depth_z.shape[-1]
+    width = surfaces.image_hw[1]
     views = [source, *others]
-    own = torch.stack((starts % width, starts // width), dim=-1).to(surfaces.depth_z)
+    own = torch.stack((starts % width, starts // width), dim=-1).to(surfaces.K)
     pixels = torch.stack([own, *(seen.pixel.flatten(0, 1)[starts] for seen in lookups)])  # (V, n, 2)
     observed = torch.stack([torch.ones_like(starts, dtype=torch.bool), *(s.agrees.flatten()[starts] for s in lookups)])
     K, T = surfaces.K[views].double(), surfaces.T_cam_world[views].double()
@@ -136,7 +135,8 @@ def _back_projected(surfaces: Surfaces, view: int, pixel: Tensor) -> Tensor:
 
     Inverse depth is interpolated, because it is linear on planes.
     """
-    depth = surfaces.depth_z[view]
+    surface = surfaces.of(view)
+    depth = surface.depth_z
     height, width = depth.shape
     low = pixel.floor().long()
     low[:, 0].clamp_(0, max(width - 2, 0))
@@ -149,7 +149,7 @@ def _back_projected(surfaces: Surfaces, view: int, pixel: Tensor) -> Tensor:
     inverse_depth = (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d)
     nearest = depth.flatten()[(v.round() * below).long() + index + (u.round() * right).long()].double()
     z = 1 / inverse_depth
-    allowed = 2 * surfaces.allowed[view].flatten()[index]
+    allowed = 2 * surface.allowed.flatten()[index]
     z = torch.where((z / nearest - 1).abs() <= allowed, z, torch.nan)
     homogeneous = torch.cat((pixel.double(), torch.ones_like(pixel[:, :1], dtype=torch.float64)), dim=-1)
     in_camera = z[:, None] * homogeneous @ torch.linalg.inv(surfaces.K[view].double()).T
