@@ -38,7 +38,7 @@ from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import FORMAT, as_json, read_json, remove_written, write_json
 from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
-from freegeo.guarded import scene_matches
+from freegeo.guarded import Evidence, scene_matches
 from freegeo.metres import ScaleSource, in_metres
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
@@ -232,14 +232,15 @@ class Job:
             return noted["failed"], None
         if not (folder / METADATA).is_file():
             assert self.scene is not None
-            images, judging, stores = [self.scene(self.model)], None, [self.folder / MATCHES_NAME]
+            images, judging = [self.scene(self.model)], None
             try:
                 if recipe.cameras:
                     assert self.photos is not None
                     self.hooks.stage("cameras to learn from")
                     images, judging = with_targets(
-                        images, [self.photos], [frozen], seed=self.seed, compute=self.compute, stores=stores
-                    )
+                        images, [self.photos], [frozen], seed=self.seed, compute=self.compute,
+                        stores=[self.folder / MATCHES_NAME],
+                    )  # fmt: skip
                 self.hooks.stage("adaptation")
                 result = train_adapter(
                     self.model, images, recipe, seed=self.seed, compute=self.compute,
@@ -256,9 +257,12 @@ class Job:
                     "evidence of the photos" if self.guard != "off" else "comparison with the frozen model"
                 )
                 started = time.monotonic()
+                evidence = Evidence.in_memory(
+                    self.photos, self.batch, frozen, priors=self.priors, store=self.folder / MATCHES_NAME,
+                    matches=None if judging is None else judging[0],
+                )  # fmt: skip
                 judge_by_photos(
-                    self.model, result, [(self.photos, self.batch)], compute=self.compute, guard=self.guard,
-                    reference=self.reference, frozen=[frozen], stores=stores, judging=judging, priors=[self.priors],
+                    self.model, result, [evidence], compute=self.compute, guard=self.guard, reference=self.reference,
                     pose_from=self.pose_from,
                 )  # fmt: skip
                 seconds["evidence"] = round(time.monotonic() - started, 2)
