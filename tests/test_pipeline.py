@@ -343,8 +343,8 @@ def judged(monkeypatch):
     told = {"state": None, "outcome": "frozen", "tried": []}
 
     def verdict(predict, references, **options):
-        for state in states():
-            told["tried"].append((state, predict(state)[0].depth_z.clone()))
+        for state, found in zip(states(), predict(0, states()), strict=True):
+            told["tried"].append((state, found.depth_z.clone()))
         chosen = None
         if told["state"] is not None:
             chosen = Trial(state=told["state"], measured=measured, gain=1.0, spread=0.1, probability=1.0, veto=None)

@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from freegeo.evidence.dense import co_visible
 from freegeo.evidence.guard import Reference, State, Verdict, try_states
 from freegeo.evidence.matches import ALL_PAIRS_UP_TO, Matches, choose_pairs, find_matches, stored_matches
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.types import ImageBatch, PhotoLike
+from freegeo.types import ImageBatch, PhotoLike, Priors
 
 HARM = 3.0
 """Factor, up or down, between distances of cameras and depth. Useful runs were seen to change it by up to 1.15, runs
@@ -74,32 +76,52 @@ def scene_matches(
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """A scene as the guard sees it."""
+    """A scene, or a chunk of a sequence, as the guard sees it; images and depth maps are made or read when needed."""
 
     photos: Sequence[PhotoLike]
-    batch: ImageBatch
-    frozen: Reconstruction
-    """Prediction of all photos by the frozen model."""
+    batch: Callable[[], ImageBatch]
+    """Returns the photos as images for the model."""
+    frozen: Callable[[], Reconstruction] | None = None
+    """Returns the prediction of all photos by the frozen model; None: it is made anew each time."""
+    priors: Priors | None = None
+    """What the model is told of the photos."""
     store: Path | None = None
     """File for the matches; None: they are not stored."""
     matches: Matches | None = None
     """What judges; None: matches of the photos, made or read here."""
+    name: str = "the scene"
+    """In messages, where there are several."""
+    frames: tuple[int, ...] | None = None
+    """Numbers of the photos in the sequence that this is a chunk of; None: no other scene has any of them."""
+
+    @classmethod
+    def in_memory(
+        cls, photos: Sequence[PhotoLike], batch: ImageBatch, frozen: Reconstruction | None = None, **more: Any
+    ) -> Evidence:
+        """Return a scene whose images, and prediction if there is one, are in memory."""
+        return cls(photos=photos, batch=lambda: batch, frozen=None if frozen is None else lambda: frozen, **more)
+
+    def frozen_prediction(self) -> Reconstruction:
+        """Return what `frozen` returns, which must be given."""
+        assert self.frozen is not None
+        return self.frozen()
 
 
 def judge_adapter(
     adapted: Adapted,
     scenes: Sequence[Evidence],
-    predict: Callable[[ImageBatch], Reconstruction | None],
+    predict: Callable[[ImageBatch, Priors | None], Reconstruction | None],
     *,
     device: str,
     select: bool,
 ) -> Verdict:
-    """Judge an adapter by its scenes' photos.
+    """Judge an adapter by its scenes' photos, one scene after another.
 
     Args:
         adapted: a finished adapter, attached to its model, with states after shares of the steps (`guard.SHARES`).
-        scenes: photos and frozen predictions.
-        predict: predicts the photos of a scene with the model as it is; None when it gives no finite numbers.
+        scenes: photos and frozen predictions, which all are given. Matches stay in memory, nothing else does.
+        predict: predicts images with the model as it is, told what is known of them; None when it gives no finite
+            numbers.
         device: where depth maps are compared.
         select: bring the adapter into the state that the verdict allows; with strength 0 where it allows none.
 
@@ -109,27 +131,39 @@ def judge_adapter(
     adapter = adapted.adapter
     final = {name: value.detach().cpu().clone() for name, value in adapter.named_parameters().items()}
     kept = {**adapted.earlier, 1.0: final}
-
+    matches = {number: scene.matches for number, scene in enumerate(scenes) if scene.matches is not None}
     whole = State(steps=1.0, strength=1.0)
 
     def put(state: State) -> None:
         adapter.load(kept[state.steps])
         adapter.set_strength(state.strength)
 
-    def predicted(state: State) -> list[Candidate] | None:
-        put(state)
-        found = [predict(scene.batch) for scene in scenes]
-        return [Candidate.of(one, device) for one in found if one is not None] if None not in found else None
+    def reference(number: int) -> Reference:
+        scene = scenes[number]
+        frozen = scene.frozen_prediction()
+        if number not in matches:
+            matches[number] = scene_matches(scene.photos, frozen, scene.store, device=device)
+        return Reference.of(Candidate.of(frozen, device), matches[number])
 
-    references = [
-        Reference.of(
-            Candidate.of(scene.frozen, device),
-            scene.matches or scene_matches(scene.photos, scene.frozen, scene.store, device=device),
-        )
-        for scene in scenes
-    ]
+    def predicted(number: int, states: Sequence[State]) -> Generator[Candidate | str]:
+        scene, batch = scenes[number], scenes[number].batch()
+        # A mean over scenes does not show one that is lost; the rule sees it where there is one scene.
+        before = scene.frozen_prediction() if len(scenes) > 1 else None
+        for state in states:
+            put(state)
+            found = predict(batch, scene.priors)
+            if found is None:
+                yield "its predictions are no finite numbers."
+            elif before is not None and (wrong := harm(before, found)):
+                yield f"{scene.name}: {wrong}"
+            else:
+                yield Candidate.of(found, device)
+
+    frames = [scene.frames for scene in scenes if scene.frames is not None]
     try:
-        verdict = try_states(predicted, references)
+        verdict = try_states(
+            predicted, [partial(reference, number) for number in range(len(scenes))], views=frames or None
+        )
     finally:
         put(whole)
     if not select:

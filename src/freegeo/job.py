@@ -38,7 +38,7 @@ from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import FORMAT, as_json, read_json, remove_written, write_json
 from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
-from freegeo.guarded import scene_matches
+from freegeo.guarded import Evidence, scene_matches
 from freegeo.metres import ScaleSource, in_metres
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
@@ -302,10 +302,13 @@ class Job:
     def _judge(self, result: Adapted, frozen: Reconstruction | None, judging: list[Matches] | None) -> None:
         """Let the guard judge a finished adapter, and keep its verdict in the result."""
         assert self.photos is not None and frozen is not None
+        evidence = Evidence.in_memory(
+            self.photos, self.batch, frozen, priors=self.priors, store=self.folder / MATCHES_NAME,
+            matches=None if judging is None else judging[0],
+        )  # fmt: skip
         judge_by_photos(
-            self.model, result, [(self.photos, self.batch)], compute=self.compute, guard=self.guard,
-            reference=self.reference, frozen=[frozen], stores=[self.folder / MATCHES_NAME], judging=judging,
-            priors=[self.priors], pose_from=self.pose_from,
+            self.model, result, [evidence], compute=self.compute, guard=self.guard, reference=self.reference,
+            pose_from=self.pose_from,
         )  # fmt: skip
 
     def _adapted_prediction(self, frozen: Reconstruction) -> tuple[Reconstruction, str | None]:

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -374,10 +375,11 @@ def adapt(
             keep_after=() if guard == "off" else SHARES,
         )  # fmt: skip
     if not result.trouble:
-        judge_by_photos(
-            model, result, [(found, batch)], compute=compute, guard=guard, frozen=frozen, judging=judging,
-            priors=[priors],
+        scene = Evidence.in_memory(
+            found, batch, None if frozen is None else frozen[0], priors=priors,
+            matches=None if judging is None else judging[0],
         )  # fmt: skip
+        judge_by_photos(model, result, [scene], compute=compute, guard=guard)
     if result.trouble:
         logger.warning("%s", capital(result.trouble))
     return result
@@ -449,75 +451,65 @@ def with_targets(
 def judge_by_photos(
     model: ReconstructionModel,
     result: Adapted,
-    scenes: Sequence[tuple[Sequence[PhotoLike], ImageBatch]],
+    scenes: Sequence[Evidence],
     *,
     compute: Compute,
     guard: Guard,
     reference: str | None = None,
-    frozen: Sequence[Reconstruction] | None = None,
-    stores: Sequence[Path | None] | None = None,
-    judging: Sequence[Matches] | None = None,
-    priors: Sequence[Priors | None] | None = None,
     pose_from: PoseFrom = "camera",
 ) -> None:
     """Judge a finished adapter by the photos of its scenes, and keep the verdict in the result.
+
+    Images and depth maps of one scene are in memory at a time, besides those that the caller keeps there.
 
     Args:
         model: with the adapter.
         result: the finished run. `verdict` is set unless the guard is off or the model predicts no cameras; with
             `select` the adapter is brought into the state that it allows. Where the adapter would be used as it was
-            trained, and its predictions are broken, `harm` is set instead.
-        scenes: photos, and the same as images for the model.
+            trained, and its predictions of a scene are broken, `harm` is set instead.
+        scenes: scenes, or chunks of a sequence.
         compute: where predictions are made.
         guard: see `freegeo.guarded.judge_adapter`.
         reference: rule of the reference view.
-        frozen: predictions without the adapter; None: they are made here.
-        stores: files for the matches of the scenes; None: they are not stored.
-        judging: the matches that judge, where others taught; None: all matches of the photos.
-        priors: what the model is told of each scene; None: nothing.
         pose_from: where cameras of predictions come from.
     """
-    known = {id(batch): part for (_, batch), part in zip(scenes, priors or [None] * len(scenes), strict=True)}
 
-    def predicted(batch: ImageBatch) -> Reconstruction | None:
-        found = predict_unchecked(
-            model, batch, reference=reference, priors=known[id(batch)], pose_from=pose_from, compute=compute
-        )
+    def predicted(batch: ImageBatch, priors: Priors | None) -> Reconstruction:
+        return predict_unchecked(model, batch, reference=reference, priors=priors, pose_from=pose_from, compute=compute)
+
+    def finite(batch: ImageBatch, priors: Priors | None) -> Reconstruction | None:
+        found = predicted(batch, priors)
         return found if not_finite(found) is None else None
 
-    if frozen is None:
-        try:
-            with result.adapter.off():
-                frozen = [
-                    predict(
-                        model, batch, reference=reference, priors=known[id(batch)], pose_from=pose_from, compute=compute
-                    )
-                    for _, batch in scenes
-                ]
-        except UserError as error:
-            if guard != "off":
-                raise
-            logger.warning("Nobody looked at what the adapter does to predictions: %s", error)
-            return
-    asked = guard != "off" and all(one.has_cameras for one in frozen)
-    if not asked or guard == "report":
-        for (_, batch), before in zip(scenes, frozen, strict=True):
-            found = predict_unchecked(
-                model, batch, reference=reference, priors=known[id(batch)], pose_from=pose_from, compute=compute
+    def without_adapter(scene: Evidence) -> Reconstruction:
+        with result.adapter.off():
+            return predict(
+                model, scene.batch(), reference=reference, priors=scene.priors, pose_from=pose_from, compute=compute
             )
+
+    judged = [
+        scene if scene.frozen is not None else replace(scene, frozen=partial(without_adapter, scene))
+        for scene in scenes
+    ]
+    asked = guard != "off" and judged[0].frozen_prediction().has_cameras
+    if not asked or guard == "report":
+        for scene in judged:
+            try:
+                before = scene.frozen_prediction()
+            except UserError as error:
+                if guard != "off":
+                    raise
+                logger.warning("Nobody looked at what the adapter does to predictions: %s", error)
+                return
+            found = predicted(scene.batch(), scene.priors)
             wrong = not_finite(found) or harm(before, found)
             if wrong:
-                result.harm = f"{wrong} Lower --lr (now {result.recipe.lr:g}) or take fewer --steps."
+                where = f"{scene.name}: " if len(scenes) > 1 else ""
+                result.harm = f"{where}{wrong} Lower --lr (now {result.recipe.lr:g}) or take fewer --steps."
                 return
     if not asked:
         return
-    evidence = [
-        Evidence(photos=photos, batch=batch, frozen=before, store=store, matches=matches)
-        for (photos, batch), before, store, matches in zip(
-            scenes, frozen, stores or [None] * len(scenes), judging or [None] * len(scenes), strict=True
-        )
-    ]
-    verdict = judge_adapter(result, evidence, predicted, device=str(compute.device), select=guard == "select")
+    verdict = judge_adapter(result, judged, finite, device=str(compute.device), select=guard == "select")
     logger.info("%s", verdict.reason)
     result.verdict = verdict.as_dict()
 

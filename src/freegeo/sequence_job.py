@@ -18,12 +18,14 @@ import numpy as np
 
 from freegeo import files
 from freegeo.adaptation.adapt import Adapted
+from freegeo.adaptation.views import chunk_windows
 from freegeo.data.video import VideoFrame
 from freegeo.errors import FreeGeoError, LostFolderError, UserError
 from freegeo.export.base import KEPT_NAME
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import Reconstruction, Scale, save_streamed
 from freegeo.files import remove_written, write_json
+from freegeo.guarded import Evidence
 from freegeo.job import (
     ADAPTATION,
     FILES_STAGE,
@@ -188,19 +190,24 @@ class SequenceJob(Job):
     def _scene_images(self, model: ReconstructionModel) -> SceneImages:
         assert self.photos is not None and self.recipe is not None
         images = scene_images("photos", self.photos, model, self.recipe, self.batch, self.priors)
-        return images
+        return replace(images, windows=chunk_windows([chunk.frames for chunk in self.chunks]))
 
     def _judge(self, result: Adapted, frozen: Reconstruction | None, judging: list[Matches] | None) -> None:
         """Let the guard judge a finished adapter once, by all chunks."""
         assert self.photos is not None
-        frames = [list(chunk.frames) for chunk in self.chunks]
-        places = [self.folder / CHUNKS_FOLDER / _chunk_name(number) for number in self.numbers]
+        evidence = []
+        for number, chunk in zip(self.numbers, self.chunks, strict=True):
+            own, place = list(chunk.frames), self.folder / CHUNKS_FOLDER / _chunk_name(number)
+            evidence.append(
+                Evidence(
+                    photos=[self.photos[i] for i in own], batch=self.batch.select(own).read,
+                    frozen=partial(Reconstruction.load, place / FROZEN_FOLDER),
+                    priors=None if self.priors is None else self.priors.select(own), store=place / MATCHES_NAME,
+                    name=f"chunk {number + 1}", frames=chunk.frames,
+                )
+            )  # fmt: skip
         judge_by_photos(
-            self.model, result, [([self.photos[i] for i in own], self.batch.select(own)) for own in frames],
-            compute=self.compute, guard=self.guard, reference=self.reference,
-            frozen=[Reconstruction.load(place / FROZEN_FOLDER) for place in places],
-            stores=[place / MATCHES_NAME for place in places],
-            priors=None if self.priors is None else [self.priors.select(own) for own in frames],
+            self.model, result, evidence, compute=self.compute, guard=self.guard, reference=self.reference,
             pose_from=self.pose_from,
         )  # fmt: skip
 
@@ -366,7 +373,7 @@ class SequenceJob(Job):
             save_streamed(
                 folder, names=batch.names, photo_hw=batch.photo_hw.numpy(), scale_xy=batch.scale_xy.numpy(),
                 offset_xy=batch.offset_xy.numpy(), T_cam_world=T_cam_world, K=K, scale=scale,
-                blocks=lambda name: joined.blocks(name, factor), sky=joined.has_sky,
+                blocks=lambda name: joined.blocks(name, factor),
             )  # fmt: skip
             return Reconstruction.load(folder)
 

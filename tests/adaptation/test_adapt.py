@@ -18,10 +18,10 @@ from freegeo.adaptation.adapt import adapt, learning_rate, loss_change, trouble
 from freegeo.adaptation.adapter import Adapter, PackedDropout
 from freegeo.adaptation.losses import adaptation_loss, draw_tokens, feature_distance
 from freegeo.adaptation.memory import Plan
-from freegeo.adaptation.recipe import paper, released
+from freegeo.adaptation.recipe import evidence, paper, released
 from freegeo.adaptation.samples import SceneImages, released_augmentation
 from freegeo.adaptation.state import UNFINISHED_FILE
-from freegeo.adaptation.views import schedule
+from freegeo.adaptation.views import chunk_windows, schedule
 from freegeo.errors import DivergedError, FreeGeoError, UserError
 from freegeo.models.precision import Compute
 from loss_tools import teacher_side
@@ -704,7 +704,7 @@ def test_a_killed_process_s_run_ends_with_the_same_tensors(tmp_path):
     assert same(tensors(resumed), tensors(whole))
 
 
-@pytest.mark.parametrize("changed", ["seed", "recipe", "scenes", "compute"])
+@pytest.mark.parametrize("changed", ["seed", "recipe", "scenes", "windows", "compute"])
 def test_the_state_of_another_run_is_refused(changed, tmp_path, monkeypatch):
     monkeypatch.setattr(adapting, "SAVE_EVERY_S", -1.0)
     model = tiny_da3()
@@ -715,6 +715,7 @@ def test_the_state_of_another_run_is_refused(changed, tmp_path, monkeypatch):
         "seed": {"seed": 1},
         "recipe": {"recipe": recipe.changed(lr=1.0)},
         "scenes": {"scenes": [noise_scene(8)]},
+        "windows": {"scenes": [replace(noise_scene(9), windows=((0, 1, 2, 3), (4, 5, 6, 7, 8)))]},
         "compute": {"compute": Compute(precision="bf16")},
     }[changed]
     with pytest.raises(UserError, match="belongs to another run"):
@@ -735,3 +736,52 @@ def test_a_damaged_state_is_refused(tmp_path):
 )
 def test_loss_change_is_of_the_first_and_last_tenth(totals, first, last):
     assert loss_change([{"total": total} for total in totals]) == {"first": first, "last": last}
+
+
+# Sequences ------------------------------------------------------------------------------------------------------------
+
+
+def in_windows(count: int, *windows, load=None) -> SceneImages:
+    scene = noise_scene(count)
+    return replace(scene, windows=tuple(map(tuple, windows)), load=load or scene.load)
+
+
+def test_a_sequence_is_learned_part_by_part_and_its_images_are_never_loaded_together(caplog):
+    model, scene, asked = tiny_da3(), noise_scene(60), []
+
+    def load(frames):
+        asked.append(tuple(frames))
+        return scene.load(frames)
+
+    windows = chunk_windows([tuple(range(start, start + 12)) for start in range(0, 49, 8)])
+    recipe = quick(model, steps=len(windows))
+    with caplog.at_level("INFO"):
+        result = run(model, [in_windows(60, *windows, load=load)], recipe)
+    assert max(map(len, asked)) <= recipe.views
+    assert all(any(set(frames) <= set(window) for window in windows) for frames in asked)
+    assert {frame for frames in asked for frame in frames} > set(range(0, 50, 10)), "from the first to the last part"
+    assert result.metadata()["windows"] == [len(windows)]
+    assert "cannot visit" not in caplog.text
+    result.adapter.detach()
+    plain = run(model, [scene], recipe)
+    assert plain.metadata()["windows"] == [None]
+    assert not same(tensors(plain), tensors(result))
+
+
+def test_what_the_parts_of_a_sequence_are_too_small_or_too_many_for_is_said(caplog):
+    with caplog.at_level("INFO"):
+        run(tiny_da3(), [in_windows(12, range(4), range(4, 8), range(8, 12))], quick(tiny_da3(), steps=2))
+    assert "3 of 3 parts of the sequence have fewer photos (4) than the 8 views" in caplog.text
+    assert "2 view sets cannot visit all 3 parts of the sequence" in caplog.text
+
+
+def test_a_recipe_that_learns_cameras_refuses_a_sequence_in_chunks():
+    model = tiny_da3()
+    with pytest.raises(UserError, match=r"recipe 'evidence' learns from cameras .* a sequence in chunks has not"):
+        run(model, [in_windows(12, range(4), range(4, 12))], evidence(model.spec))
+
+
+@pytest.mark.parametrize("window", [(0, 2, 1), (1, 1, 2), (-1, 0, 1), (7, 8, 9)])
+def test_windows_of_frames_that_are_not_there_are_refused(window):
+    with pytest.raises(ValueError, match="ascending numbers below 9"):
+        in_windows(9, (0, 1, 2), window)

@@ -1,11 +1,16 @@
-"""View draws and augmentation are those of the release, seed by seed; small scenes do what the recipe says."""
+"""View draws and augmentation are those of the release, seed by seed; small scenes do what the recipe says.
+
+View sets of a sequence are drawn from its chunks and across their seams.
+"""
+
+from dataclasses import replace
 
 import pytest
 import torch
 
 from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.samples import released_augmentation
-from freegeo.adaptation.views import draw_frames, kept_positions, schedule, view_sets
+from freegeo.adaptation.views import chunk_windows, draw_frames, kept_positions, schedule, view_sets
 from freegeo.errors import UserError
 from tiny_models import quick, tiny_da3
 
@@ -130,3 +135,76 @@ def test_a_number_of_steps_goes_through_as_many_epochs_as_it_takes():
     steps = schedule([9], quick(MODEL, steps=7), seed=0)
     assert len(steps) == 7
     assert [step[0].epoch for step in steps] == [0, 0, 0, 1, 1, 1, 2]
+
+
+# -- sequences
+
+
+def chunks(count: int, size: int, overlap: int) -> list[tuple[int, ...]]:
+    """Chunks of a sequence; the last may be shorter."""
+    starts = range(0, count - overlap, size - overlap)
+    return [tuple(range(start, min(start + size, count))) for start in starts]
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "overlap"), [(64, 16, 8), (60, 24, 8), (50, 16, 3), (21, 16, 8), (40, 10, 1)]
+)
+def test_a_window_across_a_seam_has_frames_of_both_chunks_around_their_overlap(count, size, overlap):
+    parts = chunks(count, size, overlap)
+    windows = chunk_windows(parts)
+    assert windows[: len(parts)] == tuple(parts)
+    across = windows[len(parts) :]
+    assert len(across) == len(parts) - 1
+    for window, first, second in zip(across, parts, parts[1:], strict=False):
+        assert len(window) == size
+        assert set(first) & set(second) <= set(window) <= {*first, *second}
+        assert set(window) - set(first) and set(window) - set(second)
+        if len(second) == size:
+            before, after = len(set(window) - set(second)), len(set(window) - set(first))
+            assert abs(before - after) <= 1
+
+
+def test_chunks_that_share_no_frame_have_no_window_across_and_small_ones_none_at_all():
+    assert chunk_windows([(0, 1, 2, 3), (4, 5, 6, 7)]) == ((0, 1, 2, 3), (4, 5, 6, 7))
+    assert chunk_windows([(0, 1, 2, 3), (4, 5)]) == ((0, 1, 2, 3),)
+    assert chunk_windows([(0, 1, 2, 3)]) == ((0, 1, 2, 3),)
+    # With all but one frame shared, what lies across is one of the two chunks.
+    assert chunk_windows([(0, 1, 2, 3), (1, 2, 3, 4)]) == ((0, 1, 2, 3), (1, 2, 3, 4))
+    with pytest.raises(UserError, match="chunks of at least 3 photos"):
+        chunk_windows([(0, 1), (1, 2)])
+
+
+@pytest.mark.parametrize("neighbours", [False, True])
+@pytest.mark.parametrize("size", [6, 16])
+def test_view_sets_stay_inside_windows_and_visit_all_of_them_evenly(neighbours, size):
+    windows = chunk_windows(chunks(64, size, size // 2))
+    recipe = replace(quick(MODEL, sets_per_scene=20, distinct_seeds=20), neighbours=neighbours)
+    sets = view_sets([9, 64], recipe, windows=[None, windows])
+    assert sets[:20] == view_sets([9], recipe)
+    homes = [[window for window in windows if set(one.frames) <= set(window)] for one in sets[20:]]
+    assert all(homes)
+    assert len(homes) % len(windows) == 0 and len(homes) >= 20
+    for number, (one, found) in enumerate(zip(sets[20:], homes, strict=True)):
+        window = windows[number % len(windows)]
+        assert window in found and len(one.frames) == min(8, len(window))
+    if neighbours:
+        assert all(one.frames == tuple(range(one.frames[0], one.frames[-1] + 1)) for one in sets[20:])
+
+
+def test_an_epoch_visits_every_window_equally_often_in_an_order_of_the_seed():
+    windows = tuple(tuple(range(10 * n, 10 * n + 10)) for n in range(7))
+    recipe = quick(MODEL, epochs=1, sets_per_scene=10, distinct_seeds=10)
+    steps = schedule([70], recipe, 1, windows=[windows])
+    order = [visit.view_set.frames[0] // 10 for step in steps for visit in step]
+    assert sorted(order) == sorted([*range(7)] * 2)
+    again, other = (
+        [visit.view_set.frames[0] // 10 for step in schedule([70], recipe, seed, windows=[windows]) for visit in step]
+        for seed in (1, 2)
+    )
+    assert again == order != other
+
+
+def test_one_window_of_all_frames_changes_nothing():
+    recipe = quick(MODEL, epochs=2, batch=2)
+    assert schedule([20], recipe, 3, windows=[(tuple(range(20)),)]) == schedule([20], recipe, 3)
+    assert schedule([20, 9], recipe, 3, windows=[None, None]) == schedule([20, 9], recipe, 3)

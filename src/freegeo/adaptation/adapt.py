@@ -81,6 +81,8 @@ class Adapted:
     precision: str = "fp32"
     with_cameras: bool = False
     """Whether the model was told known cameras."""
+    windows: tuple[int | None, ...] = ()
+    """Of each scene, how many windows its view sets were drawn from; None: from all its images."""
 
     def __repr__(self) -> str:
         """Return the recipe, the number of steps, the loss at start and end, the duration, and whether to beware."""
@@ -104,6 +106,7 @@ class Adapted:
             "scenes": list(self.scenes),
             "precision": self.precision,
             "with_cameras": self.with_cameras,
+            "windows": list(self.windows),
             "loss_curve": self.curve,
             # JSON has no infinity.
             "gain": {name: value if math.isfinite(value) else None for name, value in self.gain.items()},
@@ -206,13 +209,13 @@ def adapt(
         FreeGeoError: memory that runs out even with the smallest plan.
     """
     require_seed(seed)
+    if any(scene.windows for scene in scenes):
+        require_learns_in_windows(recipe)
     require_targets(scenes, recipe)
     if any(scene.priors is not None for scene in scenes):
         require_unchanged_images(recipe)
     compute = compute.preferring(recipe.precision)
-    if said := substitution([scene.count for scene in scenes], recipe):
-        logger.info(said)
-    steps = schedule([scene.count for scene in scenes], recipe, seed)
+    steps = scheduled(scenes, recipe, seed)
     plan = plan or plan_adaptation(model, scenes, recipe, visited(steps), compute=compute, folder=resume_in)
     wanted = {share: max(1, round(share * len(steps))) for share in keep_after}
     run = _Run(model.adaptable(), scenes, recipe, steps, seed, compute, resume_in, on_step, on_epoch, wanted)
@@ -235,6 +238,22 @@ def adapt(
     )  # fmt: skip
 
 
+def scheduled(scenes: Sequence[SceneImages], recipe: Recipe, seed: int) -> list[list[Visit]]:
+    """Return the visits of every step of a run, and say what the photos make different from what was asked for."""
+    counts, windows = [scene.count for scene in scenes], [scene.windows for scene in scenes]
+    sizes = [len(window) for one in windows for window in one or ()]
+    if said := substitution(sizes, recipe, "parts of the sequence") if sizes else substitution(counts, recipe):
+        logger.info(said)
+    steps = schedule(counts, recipe, seed, windows=windows)
+    visits = sum(len(step) for step in steps)
+    if visits < len(sizes):
+        logger.info(
+            "%d view sets cannot visit all %d parts of the sequence; which are left out depends on the seed. More "
+            "--steps visit all.", visits, len(sizes),
+        )  # fmt: skip
+    return steps
+
+
 def require_targets(scenes: Sequence[SceneImages], recipe: Recipe) -> None:
     """Raise UserError when the recipe learns from cameras and a scene has none."""
     without = [scene.name for scene in scenes if scene.targets is None]
@@ -251,6 +270,15 @@ def require_unchanged_images(recipe: Recipe) -> None:
         raise UserError(
             f"recipe '{recipe.name}' mirrors or squashes the images, and known cameras are of the photos as they are. "
             "Choose another --recipe, such as scene, or leave the cameras out."
+        )
+
+
+def require_learns_in_windows(recipe: Recipe) -> None:
+    """Raise UserError for a recipe that cannot learn from a sequence whose photos are in chunks."""
+    if recipe.cameras:
+        raise UserError(
+            f"recipe '{recipe.name}' learns from cameras that bundle adjustment finds for all photos together, which a "
+            "sequence in chunks has not. Choose another --recipe, such as scene."
         )
 
 
@@ -282,6 +310,7 @@ def _train(run: _Run, plan: Plan) -> Adapted:
     result = Adapted(
         adapter=adapter, recipe=recipe, seed=run.seed, scenes=tuple(scene.name for scene in run.scenes),
         precision=run.compute.precision, with_cameras=any(scene.priors is not None for scene in run.scenes),
+        windows=tuple(None if scene.windows is None else len(scene.windows) for scene in run.scenes),
     )  # fmt: skip
     with ExitStack() as undo:
         undo.callback(adapter.detach)
@@ -510,10 +539,15 @@ class _State:
     def _identity(self) -> str:
         """Return a fingerprint of model name, scenes, recipe, seed and precision; pixels and weights are left out.
 
-        Targets and priors of a scene are in it: they depend on more than the photos.
+        Targets and priors of a scene are in it, which depend on more than the photos, and its windows.
         """
         scenes = [
-            (scene.name, scene.count, *(part and part.digest() for part in (scene.targets, scene.priors)))
+            (
+                scene.name,
+                scene.count,
+                *(part and part.digest() for part in (scene.targets, scene.priors)),
+                *(scene.windows or ()),
+            )
             for scene in self.run.scenes
         ]
         model, recipe = self.run.model.spec.name, asdict(self.run.recipe)

@@ -34,7 +34,7 @@ from freegeo.adaptation.losses import (
     teacher_spread,
 )
 from freegeo.adaptation.recipe import LossConfig, Recipe
-from freegeo.adaptation.views import ViewSet, Visit
+from freegeo.adaptation.views import ViewSet, Visit, Windows
 from freegeo.errors import UserError
 from freegeo.files import scratch_folder
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
@@ -71,6 +71,14 @@ class SceneImages:
     """Cameras of the images to learn from; needed by a recipe with the weight `cameras`."""
     priors: Priors | None = None
     """What teacher and student are told of the images, all of which the model can take (`models.priors.usable`)."""
+    windows: Windows | None = None
+    """Groups of images that show one part of a long sequence: each view set is drawn from one of them; None: from all
+    images (`views.chunk_windows`)."""
+
+    def __post_init__(self):
+        for window in self.windows or ():
+            if list(window) != sorted(set(window)) or not 0 <= window[0] <= window[-1] < self.count:
+                raise ValueError(f"a window of ascending numbers below {self.count} is needed, not {window}")
 
     @classmethod
     def from_batch(cls, name: str, batch: ImageBatch) -> SceneImages:

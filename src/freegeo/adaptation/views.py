@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 
@@ -11,6 +13,8 @@ from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
 from freegeo.errors import UserError
 
 EPOCH_SEED_STRIDE = 1_000_000
+Windows = tuple[tuple[int, ...], ...]
+"""Groups of frames of a long sequence, each ascending; a view set is drawn from one of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +33,37 @@ class ViewSet:
     def positions(self) -> tuple[int, ...]:
         """Positions in `frames` that the teacher sees: all of them."""
         return tuple(range(len(self.frames)))
+
+
+def chunk_windows(chunks: Sequence[Sequence[int]]) -> Windows:
+    """Return the windows of a sequence in chunks: each chunk, and one across each seam of two chunks in a row.
+
+    A window across a seam has the frames around the middle of what the two chunks share, as many as the larger of them
+    has. Chunks in a row that share no frame have none.
+
+    Args:
+        chunks: frames of each chunk, ascending; chunks in the order of the sequence.
+
+    Raises:
+        UserError: no chunk has the 3 frames that adaptation needs.
+    """
+    seams = [_across(first, second) for first, second in pairwise(chunks) if set(first) & set(second)]
+    windows = dict.fromkeys(tuple(frames) for frames in (*chunks, *seams) if len(frames) >= SMALLEST_SCENE)
+    if not windows:
+        raise UserError(
+            f"adaptation needs chunks of at least {SMALLEST_SCENE} photos. Use larger ones (--chunk), or reconstruct "
+            "without adapting (--no-adapt)."
+        )
+    return tuple(windows)
+
+
+def _across(first: Sequence[int], second: Sequence[int]) -> tuple[int, ...]:
+    both = sorted({*first, *second})
+    shared = [place for place, frame in enumerate(both) if frame in first and frame in second]
+    size = max(len(first), len(second))
+    start = (shared[0] + shared[-1] + 1 - size) // 2
+    start = min(max(start, 0), len(both) - size)
+    return tuple(both[start : start + size])
 
 
 def draw_frames(count: int, views: int, seed: int, *, repeat: bool, neighbours: bool = False) -> tuple[int, ...]:
@@ -55,13 +90,16 @@ def kept_positions(views: int, keep: tuple[int, ...] | None) -> tuple[int, ...]:
     return keep if fits else tuple(range(0, views, 2))
 
 
-def substitution(frame_counts: list[int], recipe: Recipe) -> str | None:
-    """Say what is done instead where scenes have fewer photos than a view set has views; None where all have enough."""
+def substitution(frame_counts: Sequence[int], recipe: Recipe, parts: str = "scenes") -> str | None:
+    """Say what is done instead where scenes have fewer photos than a view set has views; None where all have enough.
+
+    `parts` is what several of those that photos are drawn from are called.
+    """
     small = [count for count in frame_counts if count < recipe.views]
     if not small:
         return None
     count = min(small)
-    where = f"{len(small)} of {len(frame_counts)} scenes have" if len(frame_counts) > 1 else "there are"
+    where = f"{len(small)} of {len(frame_counts)} {parts} have" if len(frame_counts) > 1 else "there are"
     said = f"{where} fewer photos ({count}) than the {recipe.views} views of a view set (--views): "
     if recipe.repeat_views:
         return said + "some are repeated"
@@ -70,24 +108,40 @@ def substitution(frame_counts: list[int], recipe: Recipe) -> str | None:
     return said + f"the teacher sees all {count}, the student views {', '.join(map(str, kept))} of them{keep}"
 
 
-def view_sets(frame_counts: list[int], recipe: Recipe, epoch: int = 0) -> list[ViewSet]:
+def view_sets(
+    frame_counts: Sequence[int], recipe: Recipe, epoch: int = 0, *, windows: Sequence[Windows | None] | None = None
+) -> list[ViewSet]:
     """Draw all view sets of one epoch, scene by scene.
 
     Sets stay the same over the epochs unless the recipe redraws. Small scenes may give the same set several times.
-    UserError for a scene with fewer than 3 frames.
+
+    Args:
+        frame_counts: frames of each scene.
+        recipe: says how many sets there are of a scene. A scene with windows has as many of each window, and at least
+            one.
+        epoch: number of the epoch.
+        windows: of each scene; None, for all or for one: all its frames are one window.
+
+    Raises:
+        UserError: a scene with fewer than 3 frames.
     """
     sets = []
-    for scene, count in enumerate(frame_counts):
+    for scene, (count, parts) in enumerate(zip(frame_counts, windows or [None] * len(frame_counts), strict=True)):
         if count < SMALLEST_SCENE:
             raise UserError(
                 f"adaptation needs at least {SMALLEST_SCENE} photos, got {count}. Add photos, or reconstruct without "
                 "adapting (--no-adapt)."
             )
-        for number in range(recipe.sets_per_scene):
+        parts = parts or (range(count),)
+        for number in range(-(-recipe.sets_per_scene // len(parts)) * len(parts)):
             seed = recipe.first_seed + number % recipe.distinct_seeds
             seed += EPOCH_SEED_STRIDE * epoch if recipe.redraw else 0
-            frames = draw_frames(count, recipe.views, seed, repeat=recipe.repeat_views, neighbours=recipe.neighbours)
-            sets.append(ViewSet(scene=scene, frames=frames, kept=kept_positions(len(frames), recipe.keep), seed=seed))
+            window = parts[number % len(parts)]
+            drawn = draw_frames(
+                len(window), recipe.views, seed, repeat=recipe.repeat_views, neighbours=recipe.neighbours
+            )
+            kept = kept_positions(len(drawn), recipe.keep)
+            sets.append(ViewSet(scene=scene, frames=tuple(window[place] for place in drawn), kept=kept, seed=seed))
     return sets
 
 
@@ -100,15 +154,20 @@ class Visit:
     view_set: ViewSet
 
 
-def schedule(frame_counts: list[int], recipe: Recipe, seed: int) -> list[list[Visit]]:
-    """Return the visits of every optimiser step: epochs in shuffled order, cut into batches."""
+def schedule(
+    frame_counts: Sequence[int], recipe: Recipe, seed: int, *, windows: Sequence[Windows | None] | None = None
+) -> list[list[Visit]]:
+    """Return the visits of every optimiser step: epochs in shuffled order, cut into batches.
+
+    Arguments as for `view_sets`. A run with fewer visits than there are windows leaves some out, by the seed.
+    """
     generator = torch.Generator().manual_seed(seed)
     steps: list[list[Visit]] = []
     epoch = 0
     while recipe.steps is None or len(steps) < recipe.steps:
         if recipe.epochs is not None and epoch == recipe.epochs:
             break
-        sets = view_sets(frame_counts, recipe, epoch)
+        sets = view_sets(frame_counts, recipe, epoch, windows=windows)
         order = torch.randperm(len(sets), generator=generator).tolist()
         batches = [order[i : i + recipe.batch] for i in range(0, len(order), recipe.batch)]
         if recipe.drop_last and len(batches[-1]) < recipe.batch and len(batches) > 1:

@@ -117,6 +117,7 @@ def _train(
     from freegeo.adaptation.adapter_files import export_published, save_adapter
     from freegeo.errors import FreeGeoError
     from freegeo.evidence.guard import SHARES
+    from freegeo.guarded import Evidence
     from freegeo.pipeline import before_training, judge_by_photos
 
     def keep_epoch(epoch: int, adapter) -> None:
@@ -136,10 +137,14 @@ def _train(
             on_epoch=keep_epoch, keep_after=() if guard == "off" else SHARES,
         )  # fmt: skip
     if result.trouble is None:
-        judge_by_photos(
-            loaded, result, scenes, compute=compute, guard=guard, frozen=frozen, judging=judging,
-            priors=[one.priors for one in images],
-        )  # fmt: skip
+        nothing = [None] * len(images)
+        evidence = [
+            Evidence.in_memory(photos, batch, before, priors=one.priors, matches=matches, name=one.name)
+            for one, (photos, batch), before, matches in zip(
+                images, scenes, frozen or nothing, judging or nothing, strict=True
+            )
+        ]
+        judge_by_photos(loaded, result, evidence, compute=compute, guard=guard)
     result.save(folder)
     if result.trouble:
         raise FreeGeoError(f"{folder}: {result.trouble} The adapter is there to be looked at; do not use it.")

@@ -8,7 +8,7 @@ docs/guard.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -24,6 +24,9 @@ __all__ = ["GuardSettings", "Measurement", "Reference", "State", "Trial", "Verdi
 STRENGTHS = (1.0, 0.75, 0.5, 0.25)
 SHARES = (0.25, 0.5, 0.75)
 """Shares of the steps after which the adapter's state is kept, besides the last step."""
+SCENES = 12
+"""Most scenes, or chunks of a sequence, on which all states are tried. Of more, an even choice says which state is the
+best, and all of them whether that one is better than the frozen model."""
 _FLOOR_S1, _FLOOR_S2 = 0.05, 0.1
 """Matching pixels below which errors say nothing, added before the logarithm."""
 
@@ -129,7 +132,11 @@ class Verdict:
     chosen: Trial | None = None
     """The trial to use; None: the frozen model."""
     pairs: int = 0
-    """Pairs of views that had a say."""
+    """Pairs of views that had a say; a pair that several chunks of a sequence hold counts once."""
+    scenes: int = 1
+    """Scenes, or chunks of a sequence, that were there to judge by."""
+    judged: int = 1
+    """How many of them `frozen` and `trials` rest on."""
     used: Literal["verdict", "adapter"] = "verdict"
     """Whether the result follows the verdict, or is the adapter's as it was trained."""
 
@@ -139,6 +146,8 @@ class Verdict:
             "outcome": self.outcome,
             "reason": self.reason,
             "pairs": self.pairs,
+            "scenes": self.scenes,
+            "judged": self.judged,
             "used": self.used,
             "frozen": self.frozen.as_dict(),
             "trials": [
@@ -203,66 +212,150 @@ class Reference:
 
 
 def try_states(
-    predict: Callable[[State], Sequence[Candidate] | None],
-    references: Sequence[Reference],
+    predict: Callable[[int, Sequence[State]], Iterable[Candidate | str]],
+    references: Sequence[Callable[[], Reference]],
     *,
+    views: Sequence[Sequence[int]] | None = None,
     settings: GuardSettings | None = None,
 ) -> Verdict:
     """Predict with the states of an adapter (`states`), and judge them; without enough matches nothing is predicted.
 
+    One scene after another is looked at, so that the depth maps of only one need memory. Of more than `SCENES` scenes
+    those between an even choice are predicted with the best state alone, which counts only if it is better on all.
+
     Args:
-        predict: predictions of all photos of every scene with the adapter in a state; None when they are no finite
-            numbers, which leaves the state out.
-        references: the frozen predictions of the scenes. Their pairs are judged together.
+        predict: takes the number of a scene and states, and gives one prediction of all its photos for each state; or a
+            sentence why the adapter cannot be used in this state, which leaves the state out for all scenes.
+        references: make the frozen prediction of a scene; each is called up to twice. Pairs of all scenes are judged
+            together.
+        views: numbers of each scene's photos in the sequence that the scenes are chunks of; None: no two scenes share a
+            photo. Several predictions of one pair of photos count as one, with the mean of their gains.
         settings: None: the defaults.
     """
     settings = settings or GuardSettings()
-    base = _together([reference.measure(reference.candidate) for reference in references])
-    missing = too_little(base, [reference.matches for reference in references], settings)
+    bases, matches = (list(parts) for parts in zip(*map(_frozen_scores, references), strict=True))
+    numbers = _numbers(matches, views)
+    every = range(len(references))
+    whole = _together(bases, numbers, every)
+    missing = too_little(whole, matches, settings, photos=len(np.unique(np.concatenate(numbers))))
     if missing:
-        return Verdict(outcome="unknown", reason=missing, frozen=base)
-    found = []
-    for state in states():
-        candidates = predict(state)
-        if candidates is not None:
-            parts = zip(references, candidates, strict=True)
-            found.append((state, _together([reference.measure(candidate) for reference, candidate in parts])))
-    return judge(base, found, settings)
+        return Verdict(outcome="unknown", reason=missing, frozen=whole, scenes=len(bases), judged=len(bases))
+    look = _Scenes(predict, references)
+    some = _even_choice([number for number in every if _known(bases[number]).any()]) if len(every) > SCENES else every
+    measured, unusable = look.measured(some, states())
+    found = [(state, _together(one, numbers, some)) for state, one in measured.items()]
+    verdict = judge(_together([bases[k] for k in some], numbers, some), found, settings, unusable=unusable)
+    verdict = replace(verdict, scenes=len(every), judged=len(some))
+    if len(some) == len(every):
+        return verdict
+    where = f"{len(some)} of {len(every)} {'scenes' if views is None else 'chunks'}"
+    if verdict.chosen is None:
+        return replace(verdict, reason=f"{verdict.reason} This rests on {where}.")
+    best = verdict.chosen.state
+    rest = [number for number in every if number not in some]
+    more, unusable = look.measured(rest, [best])
+    found = [(best, _together([*measured[best], *one], numbers, [*some, *rest])) for one in more.values()]
+    base = _together([bases[number] for number in (*some, *rest)], numbers, [*some, *rest])
+    verdict = judge(base, found, settings, unusable=unusable)
+    how = "confirmed" if verdict.chosen is not None else "not confirmed"
+    reason = f"{verdict.reason} This is {best}, chosen on {where} and {how} on all."
+    return replace(verdict, reason=reason, scenes=len(every), judged=len(every))
 
 
-def _together(measured: Sequence[Measurement]) -> Measurement:
-    """Scores of several scenes as one: pairs side by side (views counted on), other numbers as means."""
+def _frozen_scores(make: Callable[[], Reference]) -> tuple[Measurement, Matches]:
+    reference = make()
+    return reference.measure(reference.candidate), reference.matches
+
+
+@dataclass(frozen=True)
+class _Scenes:
+    """Scenes that states of an adapter are measured on, each in a call of its own, which leaves no depth maps."""
+
+    predict: Callable[[int, Sequence[State]], Iterable[Candidate | str]]
+    references: Sequence[Callable[[], Reference]]
+
+    def measured(
+        self, scenes: Sequence[int], tried: Sequence[State]
+    ) -> tuple[dict[State, list[Measurement]], dict[State, str]]:
+        """Return the measurements of the states that could be used in all scenes, and why others could not."""
+        found: dict[State, list[Measurement]] = {state: [] for state in tried}
+        unusable: dict[State, str] = {}
+        for number in scenes:
+            for state, scores in self._of_one(number, list(found)):
+                if isinstance(scores, str):
+                    unusable[state] = scores
+                    del found[state]
+                else:
+                    found[state].append(scores)
+        return found, unusable
+
+    def _of_one(self, scene: int, tried: Sequence[State]) -> list[tuple[State, Measurement | str]]:
+        if not tried:
+            return []
+        reference = self.references[scene]()
+        candidates = zip(tried, self.predict(scene, tried), strict=True)
+        return [(state, one if isinstance(one, str) else reference.measure(one)) for state, one in candidates]
+
+
+def _even_choice(scenes: Sequence[int]) -> list[int]:
+    """Return `SCENES` of scenes, evenly spread; all where there are no more."""
+    places = np.linspace(0, len(scenes) - 1, min(SCENES, len(scenes))).round().astype(int)
+    return [scenes[place] for place in places]
+
+
+def _numbers(matches: Sequence[Matches], views: Sequence[Sequence[int]] | None) -> list[np.ndarray]:
+    """Numbers of each scene's photos among those of all scenes."""
+    if views is not None:
+        return [np.asarray(one, np.int64) for one in views]
+    starts = np.cumsum([0, *map(len, matches)])
+    return [start + np.arange(len(one)) for start, one in zip(starts, matches, strict=False)]
+
+
+def _together(measured: Sequence[Measurement], numbers: Sequence[np.ndarray], scenes: Sequence[int]) -> Measurement:
+    """Scores of several scenes as one: pairs of photos side by side, other numbers as means over the scenes with one.
+
+    `numbers` are those of the photos of all scenes (`_numbers`).
+    """
     if len(measured) == 1:
         return measured[0]
+    photos = [numbers[scene] for scene in scenes]
     return Measurement(
-        epipolar=_side_by_side([one.epipolar for one in measured]),
-        reprojection=_side_by_side([one.reprojection for one in measured]),
-        drift=float(np.mean([one.drift for one in measured])),
-        agreement=float(np.mean([one.agreement for one in measured])),
-        agreement_before=float(np.mean([one.agreement_before for one in measured])),
+        epipolar=_side_by_side([one.epipolar for one in measured], photos),
+        reprojection=_side_by_side([one.reprojection for one in measured], photos),
+        drift=_mean([one.drift for one in measured]),
+        agreement=_mean([one.agreement for one in measured]),
+        agreement_before=_mean([one.agreement_before for one in measured]),
     )
 
 
-def _side_by_side(scores: Sequence[PairScores]) -> PairScores:
-    # Views of different scenes are different views.
-    apart = 1 + max((int(one.pairs.max()) for one in scores if one.pairs.size), default=0)
+def _side_by_side(scores: Sequence[PairScores], photos: Sequence[np.ndarray]) -> PairScores:
     return PairScores(
-        pairs=np.concatenate([one.pairs + k * apart for k, one in enumerate(scores)]),
+        pairs=np.concatenate([own[one.pairs] for one, own in zip(scores, photos, strict=True)]),
         values=np.concatenate([one.values for one in scores]),
         used=np.concatenate([one.used for one in scores]),
         reason=None if any(one.reason is None for one in scores) else scores[0].reason,
     )
 
 
-def judge(frozen: Measurement, found: Sequence[tuple[State, Measurement]], settings: GuardSettings) -> Verdict:
-    """Compare the scores of adapter states with those of the frozen model, and choose."""
+def judge(
+    frozen: Measurement,
+    found: Sequence[tuple[State, Measurement]],
+    settings: GuardSettings,
+    *,
+    unusable: Mapping[State, str] | None = None,
+) -> Verdict:
+    """Compare the scores of adapter states with those of the frozen model, and choose.
+
+    `unusable` says why states could not be measured.
+    """
     trials = [_trial(state, measured, frozen, settings) for state, measured in found]
     usable = [t for t in trials if t.veto is None and t.probability >= settings.probability]
-    pairs = int(_known(frozen).sum())
+    pairs = len(_by_pair(np.zeros(len(frozen.epipolar.pairs)), frozen))
     if not usable:
         return Verdict(
-            outcome="frozen", reason=_why_not(trials, pairs), frozen=frozen, trials=tuple(trials), pairs=pairs
-        )
+            outcome="frozen", reason=_why_not(trials, pairs, unusable or {}), frozen=frozen, trials=tuple(trials),
+            pairs=pairs,
+        )  # fmt: skip
     best = max(usable, key=lambda trial: trial.gain)
     # Within the noise of the best the least change is the safest.
     near = [trial for trial in usable if trial.gain >= best.gain - best.spread]
@@ -274,19 +367,24 @@ def judge(frozen: Measurement, found: Sequence[tuple[State, Measurement]], setti
     return Verdict(outcome="adapted", reason=reason, frozen=frozen, trials=tuple(trials), chosen=chosen, pairs=pairs)
 
 
-def too_little(frozen: Measurement, matches: Sequence[Matches], settings: GuardSettings) -> str | None:
-    """Return why the matches of scenes cannot judge, in one sentence; None when they can."""
+def too_little(
+    frozen: Measurement, matches: Sequence[Matches], settings: GuardSettings, *, photos: int | None = None
+) -> str | None:
+    """Return why the matches of scenes cannot judge, in one sentence; None when they can.
+
+    `photos` is how many different ones the scenes have; None: none is in two scenes.
+    """
     reasons = [reason for reason in (one.reason() for one in matches) if reason]
     if len(reasons) == len(matches):
         return f"Not enough matches to judge: {reasons[0][0].lower()}{reasons[0][1:]}"
     known = _known(frozen)
-    covered = len(np.unique(frozen.epipolar.pairs[known]))
-    if known.sum() < settings.pairs:
+    covered, pairs = len(np.unique(frozen.epipolar.pairs[known])), len(_by_pair(np.zeros(len(known)), frozen))
+    if pairs < settings.pairs:
         return (
-            f"Not enough matches to judge: {known.sum()} pairs of photos have some, {settings.pairs} are needed. "
+            f"Not enough matches to judge: {pairs} pairs of photos have some, {settings.pairs} are needed. "
             "Photos that overlap more, or are sharper and brighter, have more."
         )
-    photos = sum(len(one) for one in matches)
+    photos = sum(len(one) for one in matches) if photos is None else photos
     if covered < settings.views * photos:
         return (
             f"Not enough matches to judge: they cover {covered} of {photos} photos. Leave out photos that "
@@ -305,9 +403,16 @@ def _objective(measured: Measurement) -> np.ndarray:
     return np.log(measured.epipolar.values + _FLOOR_S1) + np.log(measured.reprojection.values + _FLOOR_S2)
 
 
-def _trial(state: State, measured: Measurement, frozen: Measurement, settings: GuardSettings) -> Trial:
+def _by_pair(values: np.ndarray, frozen: Measurement) -> np.ndarray:
+    """Mean (D,) of values (P,) for each pair of photos with both scores, in the order of their first ones."""
     known = _known(frozen)
-    fall = (_objective(frozen) - _objective(measured))[known]
+    _, first, group = np.unique(frozen.epipolar.pairs[known], axis=0, return_index=True, return_inverse=True)
+    means = np.bincount(group.reshape(-1), values[known], minlength=len(first)) / np.bincount(group.reshape(-1))
+    return means[np.argsort(first)]
+
+
+def _trial(state: State, measured: Measurement, frozen: Measurement, settings: GuardSettings) -> Trial:
+    fall = _by_pair(_objective(frozen) - _objective(measured), frozen)
     veto = _veto(measured, frozen, fall, settings)
     gain = spread = float("nan")
     probability = 0.0
@@ -329,9 +434,9 @@ def _veto(measured: Measurement, frozen: Measurement, fall: np.ndarray, settings
     return None
 
 
-def _why_not(trials: Sequence[Trial], pairs: int) -> str:
+def _why_not(trials: Sequence[Trial], pairs: int, unusable: Mapping[State, str]) -> str:
     if not trials:
-        return "Adaptation cannot be used because its predictions are no finite numbers."
+        return f"Adaptation cannot be used: {next(iter(unusable.values()))}"
     vetoed = [trial for trial in trials if trial.veto is not None and trial.probability > 0]
     if all(trial.gain < 0 for trial in trials):
         return f"Adaptation made the matches between the photos fit worse over {pairs} pairs."
@@ -349,6 +454,12 @@ def _changes(before: Measurement, after: Measurement) -> str:
         f"epipolar error {before.epipolar_px:.2f} -> {after.epipolar_px:.2f} px, reprojection error "
         f"{before.reprojection_px:.2f} -> {after.reprojection_px:.2f} px"
     )
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Mean of those values that are known; nan without any."""
+    known = [value for value in values if not np.isnan(value)]
+    return float(np.mean(known)) if known else float("nan")
 
 
 def _number(value: float) -> float | None:

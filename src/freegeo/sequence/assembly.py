@@ -8,8 +8,6 @@ from functools import lru_cache
 from itertools import combinations
 from typing import Any, Literal
 
-import torch
-
 from freegeo.geometry.sim3 import Sim3
 from freegeo.sequence.alignment import Depths, Seam, align, gap
 from freegeo.sequence.chunks import Chunk, common_rows
@@ -78,21 +76,15 @@ def assemble(
             joints=[
                 Joint(
                     first=a, second=b, kind=_kind(chunks, a, b), seam=seam, reason=None,
-                    gap=gap(read(a), read(b), common_rows(chunks[a], chunks[b]), _identity(), _identity()),
+                    gap=gap(read(a), read(b), common_rows(chunks[a], chunks[b]), Sim3.identity()),
                 )
                 for (a, b), seam in seams.items()
             ],
-            sim3=[_identity() for _ in chunks],
+            sim3=[Sim3.identity() for _ in chunks],
             pieces=[[number for number, chunk in enumerate(chunks) if not chunk.loop]],
         )  # fmt: skip
     good = [pair for pair in pairs if seams[pair].reason is None]
-    edges = [
-        Edge(
-            first=a, second=b, sim3=seams[a, b].sim3, weight=seams[a, b].weight,
-            robust=_kind(chunks, a, b) == "loop",
-        )
-        for a, b in good
-    ]  # fmt: skip
+    edges = [Edge.of(a, b, seams[a, b], robust=_kind(chunks, a, b) == "loop") for a, b in good]
     found = place(len(chunks), edges, fixed_scale=fixed_scale)
     trust = dict(zip(good, found.trust, strict=True))
     of = {number: k for k, piece in enumerate(found.pieces) for number in piece}
@@ -102,10 +94,11 @@ def assemble(
         if reason is None and trust[a, b] < LEAST_TRUST:
             reason = "it contradicts the other seams."
         together = of[a] == of[b]
-        apart = gap(read(a), read(b), common_rows(chunks[a], chunks[b]), found.sim3[a], found.sim3[b])
+        between = found.sim3[a].inverse() @ found.sim3[b]
+        apart = gap(read(a), read(b), common_rows(chunks[a], chunks[b]), between) if together else None
         joints.append(
             Joint(
-                first=a, second=b, kind=_kind(chunks, a, b), seam=seams[a, b], gap=apart if together else None,
+                first=a, second=b, kind=_kind(chunks, a, b), seam=seams[a, b], gap=apart,
                 reason=reason,
             )
         )  # fmt: skip
@@ -120,9 +113,3 @@ def _kind(chunks: Sequence[Chunk], a: int, b: int) -> Kind:
         return "loop"
     return "neighbours" if b == a + 1 else "bridge"
 
-
-def _identity() -> Sim3:
-    return Sim3(
-        s=torch.ones((), dtype=torch.float64), R=torch.eye(3, dtype=torch.float64),
-        t=torch.zeros(3, dtype=torch.float64),
-    )  # fmt: skip

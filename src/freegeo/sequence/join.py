@@ -87,17 +87,13 @@ class Joined:
         self._open = lru_cache(maxsize=_OPEN)(lambda number: self.members[number].load())
         self.T_cam_world, self.K = self._cameras()
 
-    def blocks(self, name: str, factor: float = 1.0) -> Iterator[np.ndarray]:
-        """Yield `depth_z` (times a factor), `conf`, `images` or `sky` frame by frame, each (1, ...)."""
+    def blocks(self, name: str, factor: float = 1.0) -> Iterator[np.ndarray] | None:
+        """Yield `depth_z` (times a factor), `conf`, `images` or `sky` frame by frame, each (1, ...); None: no sky."""
+        if name == "sky" and self._open(0).sky is None:
+            return None
         joins = {"depth_z": lambda frame: self._depth(frame) * np.float32(factor), "conf": self._conf}
         join = joins.get(name, lambda frame: self._best(name, frame))
-        for frame in self.frames:
-            yield join(frame)[None]
-
-    @property
-    def has_sky(self) -> bool:
-        """Whether the model gives the sky."""
-        return self._open(0).sky is not None
+        return (join(frame)[None] for frame in self.frames)
 
     def _cameras(self) -> tuple[np.ndarray, np.ndarray]:
         """Cameras (n, 4, 4) and (n, 3, 3) float64 in the frame of the piece: means of the chunks' ones."""
