@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -21,6 +21,7 @@ from freegeo.adaptation.adapt import Adapted
 from freegeo.adaptation.views import chunk_windows
 from freegeo.data.video import VideoFrame
 from freegeo.errors import FreeGeoError, LostFolderError, UserError
+from freegeo.evidence.candidate import Candidate
 from freegeo.export.base import KEPT_NAME
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import Reconstruction, Scale, save_streamed
@@ -51,8 +52,9 @@ from freegeo.report.page import write_report
 from freegeo.run_folder import Part
 from freegeo.sequence.assembly import Assembly, assemble
 from freegeo.sequence.chunks import Chunk, plan_chunks
+from freegeo.sequence.cuts import find_cuts
 from freegeo.sequence.join import Joined, Member
-from freegeo.sequence.loops import Loop, loop_candidates, loop_frames, verified
+from freegeo.sequence.loops import Loop, agrees, loop_candidates, loop_frames, verified
 from freegeo.sequence.order import descriptors, in_order, similarity_order
 
 if TYPE_CHECKING:
@@ -73,8 +75,8 @@ SEQUENCE_PARTS = (
     ADAPTATION, replace(PREDICTION, files=(f"{CHUNKS_FOLDER}/",)), PLACING, REFINEMENT, JOINING, FILTERS, FORMATS,
 )  # fmt: skip
 """Parts of the settings of a job with chunks: as `freegeo.job.PARTS`, and how chunks are put together."""
-LOOP_APART = 2
-"""Frames of a loop are at least so many chunks apart."""
+LOOP_APART, FEWEST_APART = 2, 6
+"""Frames of a loop are at least so many chunks, and so many frames, apart."""
 _READ_AT_ONCE = 16
 _KNOWN_MEDIANS = ("scale", "spread", "rotation_deg", "position", "focal")
 """What is said of known cameras as the median over chunks."""
@@ -108,7 +110,7 @@ class SequenceJob(Job):
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
         self._put_in_order()
-        chunks = plan_chunks(len(self.batch), self.plan.size, self.plan.overlap)
+        chunks = self._chunks()
         adaptation = self._adapted(chunks)
         self.uses_adapter = self.adapter is not None or adaptation.used
         for number in range(len(chunks)):
@@ -155,6 +157,30 @@ class SequenceJob(Job):
         self.priors = None if self.priors is None else self.priors.select(order)
         self.masks = None if self.masks is None else [self.masks[i] for i in order]
         self.scale = self.scale.select(order) if isinstance(self.scale, Gps) else self.scale
+
+    def _chunks(self) -> list[Chunk]:
+        """Cut the sequence into chunks, none of which reaches over a place where the photos jump."""
+        assert self.photos is not None
+        noted = self._noted("prediction")
+        if "cuts" not in noted:
+            self.folder.note("prediction", {**noted, "cuts": find_cuts(self.descriptors, self.photos)})
+        ends = [*self._noted("prediction")["cuts"], len(self.batch)]
+        chunks = []
+        for start, end in zip([0, *ends[:-1]], ends, strict=True):
+            size = min(self.plan.size, end - start)
+            own = (
+                [Chunk(frames=(start,))]
+                if size < 2
+                else plan_chunks(end - start, size, min(self.plan.overlap, size - 1))
+            )
+            chunks += [replace(chunk, frames=tuple(start + frame for frame in chunk.frames)) for chunk in own]
+        for start in ends[:-1]:
+            one, two = (self.photos[i].name for i in (start - 1, start))
+            self._warn(
+                f"Nothing that {one} shows is in {two}, nor in the photos around them: the sequence is cut there. "
+                "Photos of what lies between would join both parts."
+            )
+        return chunks
 
     @cached_property
     def descriptors(self) -> np.ndarray:
@@ -244,13 +270,9 @@ class SequenceJob(Job):
     def _loops(self) -> tuple[list[Loop], list[Chunk]]:
         """Look for places that the sequence comes back to: what was found, and a chunk for each one that holds."""
         assert self.photos is not None
-        noted = self._noted("joining")
-        if "loops" not in noted:
-            with self._timed("places seen twice", JOINING):
-                candidates = loop_candidates(self.descriptors, apart=LOOP_APART * self.plan.size)
-                found = verified(candidates, self.photos)
-                self.folder.note("joining", {**self._noted("joining"), "loops": [asdict(loop) for loop in found]})
-        loops = [Loop(**values) for values in self._noted("joining")["loops"]]
+        with self._timed("places seen twice", JOINING):
+            candidates = loop_candidates(self.descriptors, apart=max(FEWEST_APART, LOOP_APART * self.plan.size))
+            loops = verified(candidates, self.photos, self.descriptors)
         tied = []
         for number, loop in enumerate(loops):
             if loop.reason is None:
@@ -266,12 +288,12 @@ class SequenceJob(Job):
     def _refuted(self, chunk: Chunk, loop: Loop) -> str | None:
         """Predict the frames around both ends of a loop together; returns why that cannot be used."""
         try:
-            self._job(chunk).make()
+            found = self._job(chunk).make().result
         except (UserError, LostFolderError):
             raise
         except FreeGeoError as error:
             return str(error)
-        return None
+        return agrees(Candidate.of(found, str(self.compute.device)), chunk.frames, loop).reason
 
     @property
     def _is_placed(self) -> bool:

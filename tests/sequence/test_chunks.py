@@ -8,7 +8,9 @@ from freegeo.errors import UserError
 from freegeo.sequence.chunks import Chunk, common_rows, plan_chunks
 
 
-@pytest.mark.parametrize(("count", "size", "overlap"), [(300, 16, 8), (17, 16, 8), (100, 7, 3), (5, 2, 1), (64, 16, 15)])
+@pytest.mark.parametrize(
+    ("count", "size", "overlap"), [(300, 16, 8), (17, 16, 8), (100, 7, 3), (5, 2, 1), (64, 16, 15)]
+)
 def test_chunks_cover_all_frames_and_share_what_they_should(count, size, overlap):
     chunks = plan_chunks(count, size, overlap)
     assert sorted({frame for chunk in chunks for frame in chunk.frames}) == list(range(count))

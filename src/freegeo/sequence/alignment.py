@@ -202,15 +202,6 @@ def gap(
     return None if shared is None else float(shared.residuals(place_first.inverse() @ place_second).median())
 
 
-def gap(first: Depths, second: Depths, rows: Sequence[tuple[int, int]], sim3: Sim3) -> float | None:
-    """Median distance between the surfaces of two chunks, relative to the depth, where `sim3` puts the second.
-
-    Arguments as for `align`; None where the shared frames have no pixel with depth in both.
-    """
-    shared = _shared(first, second, rows, fixed_scale=False)
-    return None if shared is None else float(shared.residuals(sim3).median())
-
-
 def _nothing(frames: int, pixels: int, reason: str) -> Seam:
     return Seam(
         sim3=Sim3.identity(),

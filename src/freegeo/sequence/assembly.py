@@ -76,7 +76,7 @@ def assemble(
             joints=[
                 Joint(
                     first=a, second=b, kind=_kind(chunks, a, b), seam=seam, reason=None,
-                    gap=gap(read(a), read(b), common_rows(chunks[a], chunks[b]), Sim3.identity()),
+                    gap=gap(read(a), read(b), common_rows(chunks[a], chunks[b]), Sim3.identity(), Sim3.identity()),
                 )
                 for (a, b), seam in seams.items()
             ],
@@ -94,8 +94,9 @@ def assemble(
         if reason is None and trust[a, b] < LEAST_TRUST:
             reason = "it contradicts the other seams."
         together = of[a] == of[b]
-        between = found.sim3[a].inverse() @ found.sim3[b]
-        apart = gap(read(a), read(b), common_rows(chunks[a], chunks[b]), between) if together else None
+        apart = None
+        if together:
+            apart = gap(read(a), read(b), common_rows(chunks[a], chunks[b]), found.sim3[a], found.sim3[b])
         joints.append(
             Joint(
                 first=a, second=b, kind=_kind(chunks, a, b), seam=seams[a, b], gap=apart,
@@ -112,4 +113,3 @@ def _kind(chunks: Sequence[Chunk], a: int, b: int) -> Kind:
     if chunks[a].loop or chunks[b].loop:
         return "loop"
     return "neighbours" if b == a + 1 else "bridge"
-

@@ -7,7 +7,7 @@ would fit the chunks on both sides: no seam would show it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import product
+from itertools import pairwise, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,7 +49,7 @@ def find_cuts(descriptors: np.ndarray, photos: Sequence[PhotoLike]) -> list[int]
 def _is_cut(frame: int, photos: Sequence[PhotoLike]) -> bool:
     start, end = max(0, frame - NEAR), min(len(photos), frame + NEAR)
     before, after = range(frame - start), range(frame - start, end - start)
-    inner = [pair for side in (before, after) for pair in zip(side, side[1:], strict=False)]
+    inner = [pair for side in (before, after) for pair in pairwise(side)]
     across = list(product(before, after))
     found = find_matches(photos[start:end], np.array(inner + across, np.int64))
     together = np.isin(found.outcome, _SEEN_TOGETHER)

@@ -1,0 +1,222 @@
+"""More photos than are predicted at once: chunks, pieces, a stop in the middle, and what is said of them."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from freegeo import job
+from freegeo.data.procedural import render, sample_rooms
+from freegeo.errors import FreeGeoError
+from freegeo.export.reconstruction import Reconstruction, open_reconstruction
+from freegeo.geometry.sim3 import Sim3, align_cameras
+from freegeo.types import ImageBatch
+
+FRAMES, CHUNK, OVERLAP = 14, 6, 3
+CHUNKS = ["--chunk", str(CHUNK), "--overlap", str(OVERLAP), "--order", "given"]
+COUNT = 4
+PER_VIEW = ("conf", "images", "photo_hw", "scale_xy", "offset_xy")
+
+
+@dataclass
+class Oracle:
+    """Answers with true depth and cameras, each time in another frame and unit, in place of the model."""
+
+    truth: Reconstruction
+    asked: list[tuple[str, ...]] = field(default_factory=list)
+    change: Callable[[int, Reconstruction], Reconstruction] = lambda number, result: result
+    """Of an answer, by its number."""
+
+    def __call__(self, model: object, batch: ImageBatch, **options: object) -> Reconstruction:
+        number, batch = len(self.asked), batch.read()
+        self.asked.append(batch.names)
+        rows = [self.truth.names.index(name) for name in batch.names]
+        generator = torch.Generator().manual_seed(number)
+        R = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
+        scale = torch.tensor(1 + 0.5 * number, dtype=torch.float64)
+        own = Sim3(s=scale, R=R * torch.linalg.det(R), t=torch.randn(3, generator=generator, dtype=torch.float64))
+        T, K = self.truth.cameras()
+        result = replace(
+            self.truth, names=batch.names, depth_z=self.truth.depth_z[rows] * np.float32(scale), K=K[rows],
+            T_cam_world=own.apply_to_cameras(torch.from_numpy(T[rows]).double()).float().numpy(),
+            **{name: getattr(self.truth, name)[rows] for name in PER_VIEW},
+        )  # fmt: skip
+        return self.change(number, result)
+
+
+@pytest.fixture(scope="session")
+def truth() -> Reconstruction:
+    views = render(sample_rooms([20_000_003], domain="test-id", frames=FRAMES), 48, 64)
+    return Reconstruction(
+        depth_z=views.depth_z[0].numpy(), conf=np.ones((FRAMES, 48, 64), np.float32),
+        images=(views.images[0].permute(0, 2, 3, 1) * 255).round().byte().numpy(),
+        names=tuple(f"{k:02d}.png" for k in range(FRAMES)), photo_hw=np.tile([48, 64], (FRAMES, 1)),
+        scale_xy=np.ones((FRAMES, 2)), offset_xy=np.zeros((FRAMES, 2)),
+        T_cam_world=views.T_cam_world[0].numpy(), K=views.K[0].numpy(),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def walk(truth, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("walk")
+    for name, image in zip(truth.names, truth.images, strict=True):
+        Image.fromarray(image).save(folder / name)
+    return folder
+
+
+@pytest.fixture
+def oracle(monkeypatch, truth) -> Oracle:
+    found = Oracle(truth)
+    monkeypatch.setattr(job, "predict", found)
+    return found
+
+
+def told(folder: Path) -> dict:
+    return json.loads((folder / "reconstruction.json").read_text())
+
+
+def arrays(folder: Path) -> dict[str, np.ndarray]:
+    with np.load(folder / "prediction.npz", allow_pickle=False) as content:
+        return dict(content)
+
+
+def test_chunks_become_one_result(freegeo, walk, tiny, tmp_path, oracle, truth):
+    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS, "--formats", "ply", "colmap", "npz")
+    assert outcome.code == 0, outcome.err
+    assert f"{FRAMES} photos in {COUNT} chunks of {CHUNK}, neighbours share {OVERLAP}" in outcome.err
+    result = open_reconstruction(tmp_path / "out")
+    assert result.names == truth.names
+    T, K = truth.cameras()
+    fit = align_cameras(torch.from_numpy(T).double(), torch.from_numpy(result.cameras()[0]).double(), ransac=False)
+    np.testing.assert_allclose(fit.T_cam_world.numpy(), T, atol=2e-3)
+    np.testing.assert_allclose(result.depth_z * float(fit.sim3.s), truth.depth_z, rtol=2e-3)
+    np.testing.assert_allclose(result.cameras()[1], K, rtol=1e-5)
+    about = told(tmp_path / "out")["sequence"]
+    assert [chunk["frames"] for chunk in about["chunks"]] == [6, 6, 6, 5]
+    seams = [(seam["first"], seam["second"], seam["kind"], seam["frames"]) for seam in about["seams"]]
+    assert seams == [(0, 1, "neighbours", 3), (1, 2, "neighbours", 3), (2, 3, "neighbours", 3)]
+    assert all(seam["used"] and seam["inliers"] > 0.99 and seam["gap"] < 1e-3 for seam in about["seams"])
+    assert about["pieces"] == [{"folder": ".", "first": 0, "last": FRAMES - 1, "frames": FRAMES}]
+    assert len(list((tmp_path / "out/colmap").rglob("*.png"))) == FRAMES
+
+
+def test_one_chunk_is_the_same_as_none_to_the_bit(freegeo, walk, tiny, tmp_path):
+    for name, more in (("none", []), ("one", ["--chunk", FRAMES, "--overlap", 3])):
+        assert freegeo("reconstruct", walk, "-o", tmp_path / name, *tiny, *more).code == 0
+    one, none = arrays(tmp_path / "one"), arrays(tmp_path / "none")
+    assert one.keys() == none.keys()
+    assert all(np.array_equal(one[name], none[name]) for name in one)
+    for name in ("points.ply", "scene.glb"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "none" / name).read_bytes()
+
+
+def test_a_stopped_run_continues_at_the_first_chunk_that_is_not_finished(freegeo, walk, tiny, tmp_path, oracle):
+    def stop(number: int, result: Reconstruction) -> Reconstruction:
+        if number == 2:
+            raise KeyboardInterrupt
+        return result
+
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert freegeo("reconstruct", walk, "-o", whole, *tiny, *CHUNKS).code == 0
+    oracle.asked.clear()
+    oracle.change = stop
+    assert freegeo("reconstruct", walk, "-o", parts, *tiny, *CHUNKS).code == 130
+    oracle.change = lambda number, result: result
+    del oracle.asked[2:]
+    assert freegeo("reconstruct", walk, "-o", parts, *tiny, *CHUNKS).code == 0
+    assert len(oracle.asked) == COUNT
+    one, two = arrays(whole), arrays(parts)
+    assert all(np.array_equal(one[name], two[name]) for name in one)
+    assert "already finished" in freegeo("reconstruct", walk, "-o", parts, *tiny, *CHUNKS).out
+    assert len(oracle.asked) == COUNT
+
+
+def test_chunks_that_do_not_fit_are_delivered_as_pieces(freegeo, walk, tiny, tmp_path, oracle):
+    def unlike(number: int, result: Reconstruction) -> Reconstruction:
+        if number < 2:
+            return result
+        noise = np.random.default_rng(0).lognormal(0, 1, result.depth_z.shape)
+        return replace(result, depth_z=(result.depth_z * (noise if number == 2 else 1)).astype(np.float32))
+
+    oracle.change = unlike
+    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS)
+    assert outcome.code == 3
+    assert "of 14 photos are in the result" in outcome.err
+    about = told(tmp_path / "out")["sequence"]
+    assert [seam["used"] for seam in about["seams"]] == [True, False, False]
+    assert all(seam["reason"] for seam in about["seams"] if not seam["used"])
+    folders = [tmp_path / "out" / piece["folder"] for piece in about["pieces"]]
+    names = [name for folder in folders for name in open_reconstruction(folder).names]
+    assert sorted(names) == sorted(set(names)) == [f"{k:02d}.png" for k in range(FRAMES)]
+    assert all((folder / name).is_file() for folder in folders for name in ("points.ply", "report.html"))
+    assert any("pieces" in sentence for sentence in told(tmp_path / "out")["warnings"])
+
+
+def test_a_chunk_without_an_answer_is_named_and_the_rest_is_delivered(freegeo, walk, tiny, tmp_path, oracle):
+    def fail(number: int, result: Reconstruction) -> Reconstruction:
+        if number == 3:
+            raise FreeGeoError("The model's answer is not a finite number for 5 of 5 views.")
+        return result
+
+    oracle.change = fail
+    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS)
+    assert outcome.code == 3
+    assert "Chunk 4 (frames 9-13) is left out: The model's answer is not a finite number" in outcome.err
+    about = told(tmp_path / "out")["sequence"]
+    assert [chunk["reason"] is None for chunk in about["chunks"]] == [True, True, True, False]
+    assert open_reconstruction(tmp_path / "out").names == tuple(f"{k:02d}.png" for k in range(12))
+
+
+def test_when_no_chunk_has_an_answer_the_run_fails(freegeo, walk, tiny, tmp_path, oracle):
+    def fail(number: int, result: Reconstruction) -> Reconstruction:
+        raise FreeGeoError("The model's answer is not a finite number for 5 of 5 views.")
+
+    oracle.change = fail
+    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS)
+    assert outcome.code == 1
+    assert "no chunk could be predicted" in outcome.err
+    assert not (tmp_path / "out/prediction.npz").exists()
+
+
+def test_run_adapts_once_for_all_chunks(freegeo, walk, tiny, tmp_path):
+    out = tmp_path / "out"
+    outcome = freegeo(
+        "run", walk, "-o", out, *tiny, *CHUNKS, "--steps", "2", "--sets", "2", "--guard", "off", "--refine", "off"
+    )
+    assert outcome.code in {0, 3}, outcome.err
+    assert (out / "adapter/adapter_model.safetensors").is_file()
+    assert {chunk.name for chunk in (out / "chunks").iterdir() if chunk.is_dir()} == {f"{k:04d}" for k in range(COUNT)}
+    assert all(
+        (out / f"chunks/{k:04d}/{name}prediction.npz").is_file() for k in range(COUNT) for name in ("", "frozen/")
+    )
+    assert told(out)["adapter"] == "adapter"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--chunk", "many"], "--chunk is auto or a number of photos"),
+        (["--chunk", "1"], "--chunk is auto or a number of photos"),
+        (["--chunk", "6", "--overlap", "6"], "--overlap must be from 1 to 5"),
+        (["--chunk", "6", "--overlap", "0"], "--overlap must be from 1 to 5"),
+    ],
+)
+def test_chunks_that_cannot_be_are_refused(freegeo, walk, tiny, tmp_path, options, words):
+    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *options)
+    assert outcome.code == 2
+    assert words in outcome.sentence()
+    assert not (tmp_path / "out").exists()
+
+
+def test_joining_in_another_way_predicts_nothing_again(freegeo, walk, tiny, tmp_path, oracle):
+    out = tmp_path / "out"
+    assert freegeo("reconstruct", walk, "-o", out, *tiny, *CHUNKS).code == 0
+    asked = len(oracle.asked)
+    assert freegeo("reconstruct", walk, "-o", out, *tiny, *CHUNKS, "--no-loops").code == 0
+    assert len(oracle.asked) == asked
+    assert told(out)["settings"]["joining"] == {"loops": False}
