@@ -124,6 +124,7 @@ def run_job(
     """
     from freegeo.adaptation.adapt import require_unchanged_images
     from freegeo.cameras.undistortion import UndistortedPhoto
+    from freegeo.data.photos import some_of
     from freegeo.data.video import VideoFrame
     from freegeo.job import MATCHES_NAME, PARTS, SUMMARY_NAME, Job
     from freegeo.metres import read_scale
@@ -165,6 +166,17 @@ def run_job(
     else:
         _require_joinable(known, plan)
         batch = look_at_photos(empty, photos, mixed=mixed)
+        shown = batch.shown()
+        if len(shown) < len(photos):
+            blank = sorted(set(range(len(photos))) - set(shown))
+            logger.warning(
+                "%d of %d photos are almost black, white or of one colour, and are left out of the chunks: %s.",
+                len(blank), len(photos), some_of([photos[view].name for view in blank]),
+            )  # fmt: skip
+            batch, photos = batch.select(shown), [photos[view] for view in shown]
+            known = None if known is None else known.select(shown)
+            masks = None if masks is None else [masks[view] for view in shown]
+            scale = None if placing.scale is None else read_scale(placing.scale, photos)
     priors, sentence = told(known, batch, empty.spec)
     if sentence:
         console.note(sentence)

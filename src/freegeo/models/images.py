@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from freegeo.data.image_files import is_blank
 from freegeo.errors import UserError
 from freegeo.geometry.resample import resize_area, resize_cubic
 from freegeo.models.spec import MIXED, Mixed
@@ -59,16 +60,18 @@ def look_at_photos(model: ReconstructionModel, photos: Sequence[PhotoLike], *, m
     """
     if mixed not in get_args(Mixed):
         raise UserError(f"mixed is one of {', '.join(get_args(Mixed))}, not {mixed!r}.")
-    contents, looks = hashlib.sha256(), []
+    contents, looks, blank = hashlib.sha256(), [], []
     for start in range(0, len(photos), _AT_A_TIME):
         batch = read_some(model, photos, range(start, min(start + _AT_A_TIME, len(photos))), mixed)
         contents.update(batch.digest().encode())
+        pixels = (batch.images * 255).byte().permute(0, 2, 3, 1).numpy()
+        blank += [start + row for row, image in enumerate(pixels) if is_blank(image)]
         looks.append(replace(batch, images=batch.images[:, :, :0, :0]))
         shape = batch.images.shape[1:]
     geometry = {name: torch.cat([getattr(b, name) for b in looks]) for name in ("photo_hw", "scale_xy", "offset_xy")}
     frames = Frames(
         images=torch.zeros(()).expand(len(photos), *shape), names=tuple(photo.name for photo in photos), **geometry,
-        contents=contents.hexdigest(), photos=tuple(photos), chosen=tuple(range(len(photos))), model=model, mixed=mixed,
+        contents=contents.hexdigest(), photos=tuple(photos), chosen=tuple(range(len(photos))), blank=frozenset(blank), model=model, mixed=mixed,
     )  # fmt: skip
     _warn(frames, mixed)
     return frames
@@ -84,8 +87,14 @@ class Frames(ImageBatch):
     """All photos that are read at one size."""
     chosen: tuple[int, ...]
     """Those of the batch, in its order."""
+    blank: frozenset[int]
+    """Those of all photos that are almost black, white or of one colour."""
     model: ReconstructionModel
     mixed: Mixed
+
+    def shown(self) -> list[int]:
+        """Return the views that show something; all where none does."""
+        return [view for view, photo in enumerate(self.chosen) if photo not in self.blank] or list(range(len(self)))
 
     def select(self, views: Sequence[int]) -> Frames:
         """Return the chosen views, in the order given, not read yet."""
