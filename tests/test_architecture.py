@@ -24,6 +24,7 @@ ALLOWED = {
     "taught": {"adaptation", "evidence", "export", "geometry", "guarded"},
     "progress": {"adaptation"},
     "benchmark": {"adaptation", "models", "data", "fusion", "metrics", "geometry"},
+    "sequence": {"evidence", "models", "fusion", "geometry"},
     "training": {"models", "data", "metrics", "geometry"},
     "adaptation": {"models", "data.scene", "geometry"},
     "evidence": {"export", "fusion", "metrics", "geometry"},
