@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from example_results import HOSTILE_NAME, write_example
+from example_sequences import write_sequence
 from freegeo.report.page import write_report
 
 PIXELS = """() => {
@@ -211,3 +212,57 @@ def test_it_is_readable_everywhere(open_page, address, width, dark):
     drawing = page.locator(".figure").first
     assert drawing.evaluate(LUMINANCE) >= 4.5
     assert drawing.bounding_box()["height"] > 150
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    folders = write_sequence(tmp_path_factory.mktemp("walk") / "out", 200, cut=8, unused=3)
+    return [write_report(folder) for folder in reversed(folders)][-1].as_uri()
+
+
+def test_many_views_are_turned_over_like_pages(open_page, walk):
+    page = open_page(walk)
+    shown = page.locator(".view:visible h3")
+    assert shown.count() == 12 and shown.first.inner_text() == "frame 0. frame_00000.jpg"
+    back, ahead = page.locator(".pager button").all()
+    assert back.is_disabled()
+    seen = shown.all_inner_texts()
+    while ahead.is_enabled():
+        ahead.click()
+        seen += shown.all_inner_texts()
+    assert len(set(seen)) == len(seen) == 48
+    assert page.inner_text(".pager output") == "37 to 48 of 48"
+    back.click()
+    assert page.inner_text(".pager output") == "25 to 36 of 48"
+
+
+def test_a_line_joins_the_cameras_of_a_long_sequence(open_page, walk):
+    page = open_page(walk, width=800, height=600)
+    assert page.locator("#camera3d option").count() == 101
+    with_cameras = canvas(page)
+    page.uncheck("#cameras3d")
+    assert not np.array_equal(canvas(page), with_cameras)
+    page.select_option("#camera3d", "50")
+    assert drawn(canvas(page)) > 1.5 * drawn(with_cameras), "inside the corridor, walls fill the picture"
+
+
+def test_the_other_piece_is_a_click_away(open_page, walk):
+    page = open_page(walk)
+    page.click("#pieces a")
+    page.wait_for_url("**/pieces/2/report.html")
+    assert page.inner_text("h1") == "out, piece 2"
+    page.click("#pieces a")
+    page.wait_for_url(walk)
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("width", [360, 1280])
+def test_a_sequence_is_readable_everywhere(open_page, walk, width, dark):
+    page = open_page(walk, width=width, height=844, dark=dark)
+    for detail in page.locator("summary").all():
+        detail.click()
+    assert page.evaluate("document.documentElement.scrollWidth") <= width, "no sideways scrolling"
+    for selector in ("#pieces li", "#pieces a", "#seams td", "#seams .unused td", "#loops .unused td", ".pager output"):
+        assert page.locator(selector).first.evaluate(LUMINANCE) >= 4.5, selector
+    colours = page.locator("#sequence svg text").evaluate_all("texts => texts.map((t) => getComputedStyle(t).fill)")
+    assert len(set(colours)) >= 6

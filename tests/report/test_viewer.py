@@ -9,6 +9,7 @@ import torch
 
 from exact_rooms import room
 from example_results import write_example
+from example_sequences import write_sequence
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.geometry.rotation import quat_wxyz_to_xyzw, quat_xyzw_to_matrix
 
@@ -90,6 +91,30 @@ def test_two_folders_are_compared_in_one_frame(example, tmp_path):
         assert "error" not in shown.mode.options
         first, second = shown.layers[1].stage, shown.layers[4].stage
         assert np.allclose(first.T_cam_world, second.T_cam_world, atol=1e-3)
+    finally:
+        shown.close()
+
+
+def test_pieces_are_chosen_one_at_a_time(tmp_path):
+    frames, cut = 180, 4
+    folders = write_sequence(tmp_path / "out", frames, hw=(12, 16), cut=cut)
+    shown = viewer.open_viewer(folders[:1], port=free_port())
+    try:
+        assert [layer.label for layer in shown.layers] == ["frozen (piece 1)", "frozen (piece 2)"]
+        assert shown.follow.options[-1] == "frame 71: frame_00071.jpg"
+        first, second = (layer.name for layer in shown.layers)
+        assert visible(shown.frusta[first]) == 72 and visible(shown.frusta[second]) == 0
+        shown.follow.value = shown.follow.options[3]
+        shown.shown.value = "frozen (piece 2)"
+        assert shown.follow.value == viewer.OUTSIDE
+        assert shown.follow.options[1] == "frame 64: frame_00064.jpg"
+        assert visible(shown.bands[first]) == 0 and visible(shown.bands[second]) == viewer.BANDS
+        # Of the 116 cameras, 100 and the line through all of them.
+        assert visible(shown.frusta[second]) == viewer.MOST_CAMERAS + 1
+        # Both are shown level, in the same place and at the same size.
+        extents = [viewer._extent(layer.stage) for layer in shown.layers]
+        for one, other in zip(*extents, strict=True):
+            assert np.allclose(one, other, atol=1e-3)
     finally:
         shown.close()
 

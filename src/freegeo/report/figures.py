@@ -11,21 +11,32 @@ from typing import Any
 
 import numpy as np
 
-from freegeo.report.result import Result, Stage
+from freegeo.report.result import Result, Stage, even_choice
 from freegeo.report.scene3d import level_rotation
+from freegeo.report.sequence import Course, view_numbers
 
 MAX_WIDTH = 320
 """Widest embedded picture; with many views they become narrower, so that the page stays small."""
 SMALL_WIDTH = 160
 """Up to this width pictures are stored without loss."""
 INVALID_GREY = 128
+MOST_STROKES = 100
+"""Cameras whose viewing directions are drawn."""
+MOST_NUMBERED = 12
+"""Chunks whose numbers are written into the drawing."""
 DEPTH_MAP, CONF_MAP, ERROR_MAP, CHANGE_MAP = "viridis_r", "cividis", "inferno", "RdBu_r"
 # Placeholders that the page's colours replace, so that one figure works in light and dark mode.
 _INK, _FAINT = "#010203", "#040506"
 _STAGE_INK = {"frozen": "#070809", "adapted": "#0a0b0c", "refined": "#101112", "truth": "#0d0e0f"}
+_DOUBT, _CARD, _SOFT = "#131415", "#161718", "#2b2c2d"
+_CHUNK_INK = ("#191a1b", "#1c1d1e", "#1f2021", "#222324", "#252627", "#28292a")
 _PAGE_COLOURS = {
     _INK: "currentColor",
     _FAINT: "var(--line)",
+    _DOUBT: "var(--doubt)",
+    _CARD: "var(--card)",
+    _SOFT: "var(--soft)",
+    **{ink: f"var(--chunk{number})" for number, ink in enumerate(_CHUNK_INK)},
     **{ink: f"var(--{key})" for key, ink in _STAGE_INK.items()},
 }
 
@@ -109,9 +120,9 @@ def camera_plan(result: Result) -> str:
     assert final.T_cam_world is not None
     level = level_rotation(final.T_cam_world)
     with _figure(5.6, 4.4) as (fig, axes):
-        reach = _reach(result, level)
+        reach, numbers = _reach(result, level), view_numbers(result)
         for stage in result.stages.values():
-            _draw_cameras(axes, stage, level, 0.1 * reach)
+            _draw_cameras(axes, stage, level, 0.1 * reach, numbers)
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.08)
         axes.set_xlabel("to the right")
@@ -134,17 +145,60 @@ def _plan(stage: Stage, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return centres[:, (0, 2)] * (1, -1), directions[:, (0, 2)] * (1, -1)
 
 
-def _draw_cameras(axes: Any, stage: Stage, level: np.ndarray, length: float) -> None:
+def _draw_cameras(axes: Any, stage: Stage, level: np.ndarray, length: float, numbers: list[str]) -> None:
     places, directions = _plan(stage, level)
     colour = _STAGE_INK[stage.key]
+    shown = even_choice(len(places), MOST_STROKES)
     axes.plot(*places.T, "-", color=colour, linewidth=0.8, alpha=0.6)
-    axes.plot(*places.T, "o", color=colour, markersize=3.2, label=stage.label)
+    axes.plot(*places[shown].T, "o", color=colour, markersize=3.2, label=stage.label)
     tips = places + length * directions
-    for place, tip in zip(places, tips, strict=True):
-        axes.plot(*np.stack((place, tip)).T, "-", color=colour, linewidth=1.4)
+    for view in shown:
+        axes.plot(*np.stack((places[view], tips[view])).T, "-", color=colour, linewidth=1.4)
     if stage.key != "truth":
         for view in sorted({0, len(places) - 1}):
-            axes.annotate(str(view + 1), places[view], xytext=(4, 4), textcoords="offset points", color=colour)
+            axes.annotate(numbers[view], places[view], xytext=(4, 4), textcoords="offset points", color=colour)
+
+
+def trajectory(result: Result, course: Course) -> str:
+    """SVG of the cameras' path from above, each chunk in a colour, with seams and loops."""
+    final = result.final
+    assert final.T_cam_world is not None
+    level = level_rotation(final.T_cam_world)
+    places, _ = _plan(final, level)
+    with _figure(5.6, 4.8) as (fig, axes):
+        if result.truth is not None and result.truth.T_cam_world is not None:
+            axes.plot(
+                *_plan(result.truth, level)[0].T, "-", color=_STAGE_INK["truth"], linewidth=0.9, label="ground truth"
+            )
+        for number, rows in course.parts:
+            axes.plot(*places[rows].T, "-", color=_CHUNK_INK[number % len(_CHUNK_INK)], linewidth=2.2)
+        for used, colour, style, label in ((True, _INK, "--", "loop"), (False, _SOFT, ":", "loop, not used")):
+            for first, second in ((a, b) for a, b, is_used in course.loops if is_used == used):
+                axes.plot(*places[[first, second]].T, style, color=colour, linewidth=1.2, label=label)
+                label = None
+        good = [row for row, used, _ in course.seams if used]
+        if good:
+            axes.plot(*places[good].T, "o", markersize=4, color=_CARD, markeredgecolor=_INK, label="seam")
+        bad = [(row, label) for row, used, label in course.seams if not used]
+        if bad:
+            rows = [row for row, _ in bad]
+            axes.plot(*places[rows].T, "X", markersize=9, color=_DOUBT, markeredgecolor=_CARD, label="seam, not used")
+        for row, label in bad[:MOST_NUMBERED]:
+            axes.annotate(label, places[row], xytext=(6, -13), textcoords="offset points", color=_DOUBT)
+        for part in even_choice(len(course.parts), MOST_NUMBERED):
+            number, rows = course.parts[part]
+            colour = _CHUNK_INK[number % len(_CHUNK_INK)]
+            place = places[rows[len(rows) // 2]]
+            axes.annotate(str(number), place, xytext=(4, 4), textcoords="offset points", color=colour)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.08)
+        axes.set_xlabel("to the right")
+        axes.set_ylabel("forward")
+        handles, labels = axes.get_legend_handles_labels()
+        if handles:
+            # Above the drawing, where it covers nothing of it.
+            fig.legend(handles, labels, loc="outside upper left", ncols=3, frameon=False, labelcolor=_INK)
+        return _svg(fig)
 
 
 @contextmanager

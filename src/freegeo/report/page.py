@@ -10,20 +10,23 @@ import numpy as np
 
 from freegeo import files
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.report import figures
+from freegeo.report import figures, sequence
 from freegeo.report.answer import HEADER, NOTE, answer
 from freegeo.report.pairs import PairPicture, pair_pictures
-from freegeo.report.result import LABELS, Result, camera_difference, load_result
-from freegeo.report.scene3d import ERROR_LIMIT, MAX_KEPT, scene_data
+from freegeo.report.result import LABELS, MANY_VIEWS, REPORT_NAME, Result, camera_difference, even_choice, load_result
+from freegeo.report.scene3d import ERROR_LIMIT, drawn_cameras, most_kept, scene_data
 from freegeo.types import PhotoLike
 
-FILE_NAME = "report.html"
 TEMPLATE = "report.html.j2"
 Range = tuple[float, float]
 CHANGE_LIMIT = 0.2
 """Relative depth change at the end of the colour scale."""
-MANY_VIEWS, NARROW_WIDTH = 16, 224
-"""With more than `MANY_VIEWS` views, pictures are at most `NARROW_WIDTH` pixels wide."""
+SOME_VIEWS, NARROW_WIDTH = 16, 224
+"""With more than `SOME_VIEWS` views, pictures are at most `NARROW_WIDTH` pixels wide."""
+VIEWS_A_PAGE = 12
+"""Views of the gallery that are shown at once, when it does not show all of them."""
+MOST_WARNINGS = 12
+"""Warnings that are shown at the top; the others are behind a click."""
 SCORE_LABELS = {
     "auc03": "AUC@3°", "auc05": "AUC@5°", "auc15": "AUC@15°", "auc30": "AUC@30°", "abs_rel": "depth error (abs-rel)",
     "f1_rel5": "F1 of points",
@@ -54,8 +57,8 @@ def write_report(
         FreeGeoError: a damaged file, or ground truth of another size.
     """
     result = load_result(Path(folder), truth=truth)
-    pairs = pair_pictures(result.folder, Reconstruction.load(result.folder), photos)
-    path = result.folder / FILE_NAME
+    pairs = pair_pictures(result.folder, result.full[result.final.key], photos)
+    path = result.folder / REPORT_NAME
     with files.atomic_path(path) as part:
         part.write_text(render(result, pairs), encoding="utf-8")
     return path
@@ -71,8 +74,11 @@ def render(result: Result, pairs: Sequence[PairPicture] = ()) -> str:
         lstrip_blocks=True,
     )  # fmt: skip
     curve = result.adaptation.get("loss_curve") or []
+    course, numbers = sequence.course(result), sequence.view_numbers(result)
+    # The trajectory shows the cameras already, unless there are others to compare them with.
+    with_plan = result.has_cameras and (course is None or len(result.stages) > 1)
     return environment.get_template(TEMPLATE).render(
-        title=result.folder.resolve().name,
+        title=sequence.title(result),
         facts=facts(result),
         answer=answer(result.summary),
         answer_header=HEADER,
@@ -82,12 +88,19 @@ def render(result: Result, pairs: Sequence[PairPicture] = ()) -> str:
         stages=[{"key": s.key, "label": s.label} for s in result.stages.values()],
         predictions=[{"key": s.key, "label": s.label} for s in result.predictions],
         scene=scene_data(result) if result.has_cameras else None,
-        most_points=MAX_KEPT,
+        most_points=most_kept(result),
+        sequence=sequence.told(result),
+        trajectory=Markup(figures.trajectory(result, course)) if course and result.has_cameras else None,
+        most_warnings=MOST_WARNINGS,
+        step=result.step,
         has_error=result.truth is not None,
         views=views(result),
         legends=legends(result),
-        names=list(result.names),
-        plan=Markup(figures.camera_plan(result)) if result.has_cameras else None,
+        view_count=len(numbers),
+        shown_views=min(len(numbers), MANY_VIEWS),
+        views_a_page=VIEWS_A_PAGE,
+        cameras3d=[f"{numbers[view]}: {result.names[view]}" for view in drawn_cameras(result)],
+        plan=Markup(figures.camera_plan(result)) if with_plan else None,
         cameras=camera_rows(result),
         loss=Markup(figures.loss_curve(curve)) if curve else None,
         steps=len(curve),
@@ -116,13 +129,14 @@ FILES = (
 def facts(result: Result) -> list[tuple[str, str]]:
     """The key facts at the top of the page, as (name, value)."""
     summary, final = result.summary, result.final
-    height, width = final.depth_z.shape[1:]
+    height, width = result.full[final.key].image_hw
+    kept = 1 - sum(final.removed.values()) / result.pixels if final.removed else final.keep.mean()
     found = [
         ("model", str(summary.get("model", "unknown"))),
         ("views", str(len(result.names))),
         ("resolution", f"{width} × {height}"),
         ("lengths", result.lengths),
-        ("kept pixels", f"{_percent(final.keep.mean())} of {final.keep.size:,}"),
+        ("kept pixels", f"{_percent(kept)} of {result.pixels:,}"),
     ]
     if known := summary.get("known_cameras"):
         found.append(("known cameras", f"{known['poses']} poses, {known['intrinsics']} intrinsics"))
@@ -134,13 +148,15 @@ def facts(result: Result) -> list[tuple[str, str]]:
 
 
 def views(result: Result) -> Iterator[dict[str, Any]]:
-    """One entry per photo: its name and its pictures, each (class, caption, data URI)."""
-    width = figures.MAX_WIDTH if len(result.names) <= MANY_VIEWS else NARROW_WIDTH
+    """One entry per photo, or for each of an even choice: name, title and pictures, each (class, caption, data URI)."""
+    width = figures.MAX_WIDTH if len(result.names) <= SOME_VIEWS else NARROW_WIDTH
     depth_range, conf_range = map_ranges(result)
-    for view, name in enumerate(result.names):
-        pictures = [("photo", "photo", result.images[view]), *_maps(result, view, depth_range, conf_range)]
+    images, numbers = result.full[result.final.key].images, sequence.view_numbers(result)
+    for view in even_choice(len(numbers), MANY_VIEWS):
+        pictures = [("photo", "photo", images[view]), *_maps(result, view, depth_range, conf_range)]
         yield {
-            "name": name,
+            "title": f"{numbers[view]}. {result.names[view]}",
+            "name": result.names[view],
             "pictures": [(kind, caption, figures.data_uri(image, width)) for kind, caption, image in pictures],
         }
 
@@ -148,17 +164,18 @@ def views(result: Result) -> Iterator[dict[str, Any]]:
 def _maps(result: Result, view: int, depth_range: Range, conf_range: Range) -> Iterator[tuple[str, str, np.ndarray]]:
     """The colour-coded maps of a view: CSS classes, caption, image."""
     for stage in result.stages.values():
-        depth = figures.log_colours(stage.depth_z[view], depth_range, figures.DEPTH_MAP)
+        depth = figures.log_colours(result.view_depth(stage, view), depth_range, figures.DEPTH_MAP)
         yield f"depth {stage.key}", f"depth, {stage.label}", depth
     if len(result.predictions) > 1:
-        before, after = (result.predictions[k].depth_z[view] for k in (0, -1))
+        before, after = (result.view_depth(result.predictions[k], view) for k in (0, -1))
         yield "depth", "change of depth", change_map(before, after)
     for stage in result.predictions:
-        if stage.error is not None:
-            error = figures.linear_colours(stage.error[view], (0, ERROR_LIMIT), figures.ERROR_MAP)
-            yield f"error {stage.key}", f"depth error, {stage.label}", error
+        error = result.view_error(stage, view)
+        if error is not None:
+            colours = figures.linear_colours(error, (0, ERROR_LIMIT), figures.ERROR_MAP)
+            yield f"error {stage.key}", f"depth error, {stage.label}", colours
     for stage in result.predictions:
-        conf = figures.log_colours(stage.conf[view], conf_range, figures.CONF_MAP)
+        conf = figures.log_colours(result.full[stage.key].conf[view], conf_range, figures.CONF_MAP)
         yield f"confidence {stage.key}", f"confidence, {stage.label}", conf
 
 
@@ -244,7 +261,7 @@ def score_table(scores: Mapping[str, Any]) -> dict[str, Any] | None:
 
 def filter_tables(result: Result) -> list[dict[str, Any]]:
     """Pixels that the filters removed, per model."""
-    return [_filter_table(stage.label, stage.removed, stage.keep.size) for stage in result.predictions if stage.removed]
+    return [_filter_table(stage.label, stage.removed, result.pixels) for stage in result.predictions if stage.removed]
 
 
 def _filter_table(label: str, removed: Mapping[str, int], pixels: int) -> dict[str, Any]:

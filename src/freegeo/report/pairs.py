@@ -60,6 +60,8 @@ class PairPicture:
     sides: tuple[Side, Side]
     count: int
     """Matches of the pair."""
+    of: int
+    """Pairs of the result that have matches."""
     median_px: float
     """Its epipolar error (S1), matching pixels."""
     distances_px: list[float]
@@ -83,7 +85,7 @@ def pair_pictures(folder: Path, result: Reconstruction, photos: Sequence[PhotoLi
     order = known[np.argsort(scores.values[known], kind="stable")]
     chosen = {"best": order[:1], "worst": order[1:][-1:]}
     found = [
-        _picture(what, int(pair), float(scores.values[pair]), candidate, matches, result, photos)
+        _picture(what, int(pair), len(known), float(scores.values[pair]), candidate, matches, result, photos)
         for what, pairs in chosen.items()
         for pair in pairs
     ]
@@ -94,6 +96,7 @@ def pair_pictures(folder: Path, result: Reconstruction, photos: Sequence[PhotoLi
 def _picture(
     what: str,
     pair: int,
+    of: int,
     median_px: float,
     candidate: Candidate,
     matches: Matches,
@@ -126,7 +129,7 @@ def _picture(
         name, uri = result.names[view], data_uri(image, WIDTH)
         sides.append(Side(name=name, uri=uri, width=width, height=height, marks=marks))
     return PairPicture(
-        what=what, sides=(sides[0], sides[1]), count=len(x), median_px=median_px,
+        what=what, sides=(sides[0], sides[1]), count=len(x), of=of, median_px=median_px,
         distances_px=[float(value) for value in distances],
     )  # fmt: skip
 

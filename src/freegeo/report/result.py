@@ -2,6 +2,9 @@
 
 A model before and after adaptation gives two reconstructions, each with its own world frame and scale, and refinement a
 third. With ground truth all are moved onto it, otherwise those before onto the result.
+
+A result may have hundreds of views, and its files may be mapped into memory. Of more than `MANY_VIEWS` views only every
+n-th pixel of each row and column is copied, which is enough for points and for ranges of colours.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import torch
 
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.formats import filter_reconstruction
-from freegeo.export.kept import load_kept
+from freegeo.export.kept import Filtered, load_kept
 from freegeo.export.reconstruction import FILE_NAME, Reconstruction
 from freegeo.files import FORMAT, read_json
 from freegeo.geometry.depth import depth_to_world, valid_depth
@@ -24,15 +27,19 @@ from freegeo.geometry.rotation import mean_rotation, rotation_angle
 from freegeo.geometry.se3 import camera_centres
 from freegeo.geometry.sim3 import Sim3
 
-SUMMARY_NAME, SCORES_NAME = "reconstruction.json", "scores.json"
+SUMMARY_NAME, SCORES_NAME, REPORT_NAME = "reconstruction.json", "scores.json", "report.html"
 FROZEN_FOLDER, UNREFINED_FOLDER, TRUTH_FOLDER = "frozen", "unrefined", "truth"
 ADAPTER_PAGE = "adapter/freegeo.json"
+MANY_VIEWS = 48
+"""Up to so many views, all pixels are read and all views are shown."""
+MOST_PIXELS = 4_000_000
+"""About so many pixels of each stage are read of more views."""
 LABELS = {"frozen": "frozen", "adapted": "adapted", "refined": "refined", "truth": "ground truth"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """One reconstruction in the common frame and scale."""
+    """One reconstruction in the common frame and scale; its maps (S, H, W) have every `Result.step`-th pixel."""
 
     key: str
     """`frozen`, `adapted`, `refined` or `truth`."""
@@ -43,11 +50,13 @@ class Stage:
     T_cam_world: np.ndarray | None
     """(S, 4, 4) float32."""
     K: np.ndarray | None
-    """(S, 3, 3) float32."""
+    """(S, 3, 3) float32, of these maps."""
     keep: np.ndarray
     """(S, H, W) bool: what the export's filters keep; all valid depth of ground truth or without cameras."""
     removed: Mapping[str, int]
-    """Pixels removed by each filter; empty where none ran."""
+    """Of all pixels, those removed by each filter; empty where none ran."""
+    scale: float = 1.0
+    """Factor from the file's depth to `depth_z`."""
     error: np.ndarray | None = None
     """(S, H, W) float32 |d - d_true| / d_true, NaN where one of them is not valid; None without ground truth."""
 
@@ -79,7 +88,11 @@ class Result:
     """Those that exist, in the order frozen, adapted, refined, truth."""
     names: Sequence[str]
     images: np.ndarray
-    """(S, H, W, 3) uint8, what the model read."""
+    """(S, H, W, 3) uint8, what the model read, at the pixels of the stages."""
+    full: Mapping[str, Reconstruction]
+    """The files of the stages, with all pixels, in their own frames and scales."""
+    step: int
+    """Of how many pixels in a row or column one is in the stages."""
     lengths: str
     """Unit of the folder's files, as it reads after "lengths are"."""
     from_own_frame: Sim3 | None
@@ -104,6 +117,21 @@ class Result:
     def has_cameras(self) -> bool:
         """Whether there is anything to show in 3D."""
         return self.final.T_cam_world is not None
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of all views."""
+        return self.full[self.final.key].depth_z.size
+
+    def view_depth(self, stage: Stage, view: int) -> np.ndarray:
+        """Return all pixels (H, W) float32 of a view's depth in the common scale."""
+        return (self.full[stage.key].depth_z[view] * stage.scale).astype(np.float32)
+
+    def view_error(self, stage: Stage, view: int) -> np.ndarray | None:
+        """Return all pixels (H, W) of a view's `Stage.error`; None without ground truth."""
+        if self.truth is None:
+            return None
+        return relative_error(self.view_depth(stage, view), self.full["truth"].depth_z[view])
 
 
 def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
@@ -131,10 +159,17 @@ def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
     for other in (*found.values(), *([truth] if truth else [])):
         if other.depth_z.shape != final.depth_z.shape:
             raise FreeGeoError(f"{folder}: reconstructions of different sizes cannot be compared. Run again.")
-    reference = truth or final
-    stages = {key: _stage(key, value, reference, truth, places[key]) for key, value in found.items()}
+    whole = {**found, **({"truth": truth} if truth else {})}
+    step = _step(final.depth_z.shape)
+    read = {key: thinned(value, step) for key, value in whole.items()}
+    last = list(found)[-1]
+    reference = read["truth" if truth else last]
+    stages = {}
+    for key in found:
+        kept = _kept(read[key], final.depth_z.shape, places[key], step) if read[key].has_cameras else None
+        stages[key] = _stage(key, read[key], reference, read.get("truth"), kept)
     if truth is not None:
-        stages["truth"] = _truth_stage(truth)
+        stages["truth"] = _truth_stage(read["truth"])
     return Result(
         folder=folder,
         summary=summary,
@@ -142,10 +177,48 @@ def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
         scores=_mapping(folder / SCORES_NAME),
         stages=stages,
         names=final.names,
-        images=final.images,
+        images=read[last].images,
+        full=whole,
+        step=step,
         lengths=final.lengths,
-        from_own_frame=align(final, reference) if final.has_cameras and reference.has_cameras else None,
+        from_own_frame=align(read[last], reference) if final.has_cameras and reference.has_cameras else None,
     )
+
+
+def even_choice(count: int, most: int) -> list[int]:
+    """Return at most `most` of the numbers 0 to count - 1, evenly spread from the first to the last, ascending."""
+    return list(range(count)) if count <= most else np.linspace(0, count - 1, most).round().astype(int).tolist()
+
+
+def _step(shape: tuple[int, ...]) -> int:
+    views, height, width = shape
+    step = 1
+    while views > MANY_VIEWS and views * (height // step) * (width // step) > MOST_PIXELS:
+        step += 1
+    return step
+
+
+def _rows(step: int) -> slice:
+    """Every `step`-th pixel, the middle one of each group."""
+    return slice(step // 2, None, step)
+
+
+def thinned(value: Reconstruction, step: int) -> Reconstruction:
+    """Return a copy with one pixel of `step` in each row and column; cameras follow. A step of 1 copies nothing."""
+    if step == 1:
+        return value
+    rows, first = _rows(step), step // 2
+    maps = {name: getattr(value, name) for name in ("depth_z", "conf", "sky", "images")}
+    K = value.K
+    if K is not None:
+        # The pixel u of the copy is the pixel step * u + first.
+        K = K.copy()
+        K[:, :2, 2] -= first
+        K[:, :2] /= step
+    return replace(
+        value, **{name: None if a is None else np.ascontiguousarray(a[:, rows, rows]) for name, a in maps.items()}, K=K,
+        scale_xy=value.scale_xy / step, offset_xy=(value.offset_xy - 0.5 - first) / step + 0.5,
+    )  # fmt: skip
 
 
 def _places(folder: Path, summary: Mapping[str, Any]) -> dict[str, Path]:
@@ -167,12 +240,19 @@ def moved(result: Result, onto: Stage) -> Result:
         raise UserError(f"{result.folder}: shows other photos or another resolution; only one scene can be compared.")
     if result.final.T_cam_world is None or onto.T_cam_world is None:
         return result
-    move = _similarity(result.final.depth_z, result.final.T_cam_world, onto.depth_z, onto.T_cam_world)
+    return moved_by(result, _similarity(result.final.depth_z, result.final.T_cam_world, onto.depth_z, onto.T_cam_world))
+
+
+def moved_by(result: Result, move: Sim3) -> Result:
+    """Return a result with cameras in another frame and scale."""
     stages = {}
     for key, stage in result.stages.items():
         assert stage.T_cam_world is not None
-        depth_z, T_cam_world = _moved(stage.depth_z, stage.T_cam_world, move)
-        stages[key] = replace(stage, depth_z=depth_z, T_cam_world=T_cam_world)
+        scale = float(move.s)
+        stages[key] = replace(
+            stage, depth_z=(stage.depth_z * scale).astype(np.float32), scale=stage.scale * scale,
+            T_cam_world=_moved_cameras(stage.T_cam_world, move),
+        )  # fmt: skip
     own = result.from_own_frame
     both = None if own is None else Sim3(s=move.s * own.s, R=move.R @ own.R, t=move.apply(own.t))
     return replace(result, stages=stages, from_own_frame=both)
@@ -206,23 +286,33 @@ def _valid(depth_z: np.ndarray) -> np.ndarray:
 
 
 def _stage(
-    key: str, value: Reconstruction, reference: Reconstruction, truth: Reconstruction | None, folder: Path
+    key: str,
+    value: Reconstruction,
+    reference: Reconstruction,
+    truth: Reconstruction | None,
+    kept: Filtered | None,
 ) -> Stage:
     keep, removed = _valid(value.depth_z) & value.inside(), {}
-    if value.has_cameras:
-        # Filtered here only where no command did, as after `Reconstruction.save`.
-        keep, report = load_kept(folder, value.depth_z.shape) or filter_reconstruction(value)
-        removed = dict(report.removed)
-    depth_z, T_cam_world = value.depth_z, value.T_cam_world
-    if value.has_cameras and reference.has_cameras:
-        depth_z, T_cam_world = _moved(depth_z, value.cameras()[0], align(value, reference))
-    else:
-        depth_z = (depth_z * median_ratio(reference.depth_z, depth_z)).astype(np.float32)
+    if kept is not None:
+        keep, removed = kept[0], dict(kept[1].removed)
+    move = align(value, reference) if value.has_cameras and reference.has_cameras else None
+    scale = median_ratio(reference.depth_z, value.depth_z) if move is None else float(move.s)
+    T_cam_world = value.T_cam_world if move is None else _moved_cameras(value.cameras()[0], move)
+    depth_z = (value.depth_z * scale).astype(np.float32)
     error = None if truth is None else relative_error(depth_z, truth.depth_z)
     return Stage(
         key=key, depth_z=depth_z, conf=value.conf, T_cam_world=T_cam_world, K=_single(value.K), keep=keep,
-        removed=removed, error=error,
+        removed=removed, scale=scale, error=error,
     )  # fmt: skip
+
+
+def _kept(value: Reconstruction, shape: tuple[int, ...], folder: Path, step: int) -> Filtered | None:
+    """What the command that wrote the folder kept, thinned like `value`; without one, filtered here if all is read."""
+    kept = load_kept(folder, shape)
+    if kept is None:
+        return filter_reconstruction(value) if step == 1 else None
+    rows = _rows(step)
+    return np.ascontiguousarray(kept[0][:, rows, rows]), kept[1]
 
 
 def _truth_stage(truth: Reconstruction) -> Stage:
@@ -237,9 +327,8 @@ def _single(values: np.ndarray | None) -> np.ndarray | None:
     return None if values is None else values.astype(np.float32)
 
 
-def _moved(depth_z: np.ndarray, T_cam_world: np.ndarray, move: Sim3) -> tuple[np.ndarray, np.ndarray]:
-    cameras = move.apply_to_cameras(torch.from_numpy(T_cam_world).double()).float().numpy()
-    return (depth_z * float(move.s)).astype(np.float32), cameras
+def _moved_cameras(T_cam_world: np.ndarray, move: Sim3) -> np.ndarray:
+    return move.apply_to_cameras(torch.from_numpy(T_cam_world).double()).float().numpy()
 
 
 def relative_error(depth_z: np.ndarray, true_z: np.ndarray) -> np.ndarray:

@@ -8,10 +8,16 @@ from typing import Any
 import numpy as np
 
 from freegeo.export.glb import frustum_corners
-from freegeo.report.result import Result, Stage
+from freegeo.report.result import MANY_VIEWS, Result, Stage, even_choice
 
 MAX_KEPT, MAX_REMOVED = 36_000, 9_000
 """Most kept and removed points of one stage in the page."""
+MAX_KEPT_OF_MANY = 100_000
+"""Most kept points with more than `MANY_VIEWS` views, which show a larger place."""
+MOST_CAMERAS = 100
+"""Cameras that are drawn; of more, these and a line through all of them."""
+MOST_PATH = 2_000
+"""Most corners of that line."""
 ERROR_LIMIT = 0.3
 """Relative depth error at the end of the colour scale."""
 NO_ERROR = 255
@@ -35,6 +41,16 @@ def _unit(vector: np.ndarray, otherwise: np.ndarray, least: float = 1e-6) -> np.
     return chosen / np.linalg.norm(chosen)
 
 
+def most_kept(result: Result) -> int:
+    """Most kept points of a stage in the page."""
+    return MAX_KEPT if len(result.names) <= MANY_VIEWS else MAX_KEPT_OF_MANY
+
+
+def drawn_cameras(result: Result) -> list[int]:
+    """Views whose cameras are drawn."""
+    return even_choice(len(result.names), MOST_CAMERAS)
+
+
 def scene_data(result: Result) -> dict[str, Any]:
     """Everything the page's 3D view needs, as JSON-like values; UserError without cameras."""
     final = result.final
@@ -52,8 +68,9 @@ def scene_data(result: Result) -> dict[str, Any]:
             {
                 "key": stage.key,
                 "label": stage.label,
-                **_packed(stage, points[stage.key], result.images, spacing),
-                "cameras": _cameras(stage, level, 0.1 * radius),
+                **_packed(stage, points[stage.key], result.images, spacing, most_kept(result)),
+                "cameras": _cameras(stage, drawn_cameras(result), level, frustum_depth(stage, 0.1 * radius)),
+                "path": _path(stage, level),
                 "spacing": spacing,
             }
             for stage in result.stages.values()
@@ -61,7 +78,7 @@ def scene_data(result: Result) -> dict[str, Any]:
     }
 
 
-def _packed(stage: Stage, points: np.ndarray, images: np.ndarray, spacing: float) -> dict[str, Any]:
+def _packed(stage: Stage, points: np.ndarray, images: np.ndarray, spacing: float, most: int) -> dict[str, Any]:
     """Points as base64: xyz float32, RGB, confidence rank, error, kept flag, size, one array after the other.
 
     The size of a point is what its pixel covers, and more when points were left out: `spacing` times
@@ -69,12 +86,12 @@ def _packed(stage: Stage, points: np.ndarray, images: np.ndarray, spacing: float
     """
     rng = np.random.default_rng(0)
     valid = np.isfinite(points).all(-1) & (stage.depth_z > 0)
-    kept = _choice(np.flatnonzero(stage.keep & valid), MAX_KEPT, rng)
+    kept = _choice(np.flatnonzero(stage.keep & valid), most, rng)
     removed = _choice(np.flatnonzero(~stage.keep & valid), MAX_REMOVED, rng)
     # In random order, so that no part of the points is always drawn over another.
     index = rng.permutation(np.concatenate((kept, removed)))
     flag = stage.keep.reshape(-1)[index]
-    left_out = max(1.0, int(stage.keep.sum()) / MAX_KEPT) ** 0.5
+    left_out = max(1.0, int(stage.keep.sum()) / most) ** 0.5
     size = _covered(stage).reshape(-1)[index] * left_out
     arrays = (
         points.reshape(-1, 3)[index].astype("<f4"),
@@ -108,15 +125,40 @@ def _error_bytes(stage: Stage, index: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(error), scaled, NO_ERROR).astype(np.uint8)
 
 
-def _cameras(stage: Stage, level: np.ndarray, depth: float) -> list[list[list[float]]]:
-    """Five corners of every camera's frustum: centre, then the image's corners clockwise from top left."""
+def _cameras(stage: Stage, views: list[int], level: np.ndarray, depth: float) -> list[list[list[float]]]:
+    """Five corners of each camera's frustum: centre, then the image's corners clockwise from top left."""
     assert stage.T_cam_world is not None
     assert stage.K is not None
-    height, width = stage.depth_z.shape[1:]
-    corners = [
-        frustum_corners(T, K, (height, width), depth) @ level.T for T, K in zip(stage.T_cam_world, stage.K, strict=True)
-    ]
+    hw = stage.depth_z.shape[1], stage.depth_z.shape[2]
+    corners = [frustum_corners(stage.T_cam_world[view], stage.K[view], hw, depth) @ level.T for view in views]
     return [[_rounded(corner) for corner in camera] for camera in corners]
+
+
+def frustum_depth(stage: Stage, most: float) -> float:
+    """How deep frusta are drawn: `most`, or less where the cameras that are drawn of many would hide each other."""
+    assert stage.T_cam_world is not None
+    count = len(stage.T_cam_world)
+    if count <= MOST_CAMERAS:
+        return most
+    places = _centres(stage)[even_choice(count, MOST_CAMERAS)]
+    step = float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+    return min(most, max(step, 0.2 * most))
+
+
+def _centres(stage: Stage) -> np.ndarray:
+    """Positions of the cameras (S, 3) float64."""
+    assert stage.T_cam_world is not None
+    T = stage.T_cam_world.astype(np.float64)
+    return -np.einsum("sij,si->sj", T[:, :3, :3], T[:, :3, 3])
+
+
+def _path(stage: Stage, level: np.ndarray) -> list[list[float]]:
+    """Positions of the cameras, in order; empty where all of them are drawn."""
+    assert stage.T_cam_world is not None
+    if len(stage.T_cam_world) <= MOST_CAMERAS:
+        return []
+    centres = _centres(stage)[even_choice(len(stage.T_cam_world), MOST_PATH)]
+    return [_rounded(centre) for centre in centres @ level.T]
 
 
 def _covered(stage: Stage) -> np.ndarray:

@@ -1,7 +1,8 @@
 """The interactive viewer: one or two output folders in a browser, through viser.
 
 Points are grouped into bands of confidence. Moving the confidence slider only hides and shows bands that the browser
-already has, so it is fast over a slow connection too.
+already has, so it is fast over a slow connection too. Pieces of a sequence are shown one at a time: nothing is known of
+how they lie to each other.
 """
 
 from __future__ import annotations
@@ -22,11 +23,13 @@ from freegeo.errors import UserError
 from freegeo.export.mesh import FILE_NAME as MESH_NAME
 from freegeo.export.mesh import load_mesh
 from freegeo.geometry.rotation import matrix_to_quat_xyzw, quat_xyzw_to_wxyz
+from freegeo.geometry.sim3 import Sim3
+from freegeo.report import sequence
 from freegeo.report.answer import answer
 from freegeo.report.figures import CONF_MAP, DEPTH_MAP, ERROR_MAP, linear_colours, log_colours, log_range
 from freegeo.report.origin import own_pages_only
-from freegeo.report.result import Result, Stage, load_result, moved
-from freegeo.report.scene3d import ERROR_LIMIT, level_rotation
+from freegeo.report.result import Result, Stage, even_choice, load_result, moved, moved_by
+from freegeo.report.scene3d import ERROR_LIMIT, MOST_CAMERAS, frustum_depth, level_rotation
 
 logger = logging.getLogger(__name__)
 
@@ -59,10 +62,10 @@ class Layer:
 class Viewer:
     """A running viewer; `close` ends it."""
 
-    def __init__(self, results: Sequence[Result], *, host: str, port: int):
+    def __init__(self, results: Sequence[Result], *, names: Sequence[str], host: str, port: int):
+        """Start it; `names` tell results apart where there are several."""
         viser = _viser()
-        self.layers = _layers(results)
-        self.names = list(results[0].names)
+        self.layers = _layers(results, names)
         # viser prints its address to stdout, which the command reports itself.
         with redirect_stdout(io.StringIO()), own_pages_only(host):
             self.server = viser.ViserServer(host=host, port=port, label="freegeo", verbose=False)
@@ -77,11 +80,15 @@ class Viewer:
         }
         for layer in self.layers:
             self._add(layer, ranges)
-        for result in results:
+        for result, name in zip(results, names, strict=True):
             text = answer_text(result)
             if text is not None:
-                with self.server.gui.add_folder("Did it help?" if len(results) == 1 else result.folder.resolve().name):
+                with self.server.gui.add_folder("Did it help?" if len(results) == 1 else name):
                     self.server.gui.add_markdown(text)
+        told = sequence.told(results[0])
+        if told is not None:
+            with self.server.gui.add_folder("Sequence"):
+                self.server.gui.add_markdown("\n\n".join([" ".join(told.sentences), *told.problems]))
         self._add_controls()
         self._apply()
 
@@ -93,12 +100,7 @@ class Viewer:
     def _place(self, result: Result) -> None:
         """Choose up, size and the first view from the final cameras and points."""
         final = result.final
-        assert final.T_cam_world is not None
-        level = level_rotation(final.T_cam_world)
-        points = final.world_points()
-        seen = points[final.keep] if final.keep.any() else points.reshape(-1, 3)
-        centre = np.quantile(seen @ level.T, (0.03, 0.97), axis=0).mean(axis=0) @ level
-        self.radius = float(np.quantile(np.linalg.norm(seen - centre, axis=1), 0.9)) or 1.0
+        level, centre, self.radius = _extent(final)
         self.spacing = _spacing(final)
         self.server.scene.set_up_direction(level[1])
         self.server.scene.configure_default_lights(cast_shadow=False)
@@ -129,15 +131,19 @@ class Viewer:
         assert stage.K is not None
         height, width = stage.depth_z.shape[1:]
         poses, places = camera_poses(stage)
-        for view, image in enumerate(layer.result.images):
+        images = layer.result.full[layer.result.final.key].images
+        colour, scale = STAGE_COLOURS[stage.key], frustum_depth(stage, FRUSTUM_SHARE * self.radius)
+        for view in even_choice(len(places), MOST_CAMERAS):
             handle = self.server.scene.add_camera_frustum(
-                f"{layer.name}/cameras/{view:03d}", fov=field_of_view(stage, view), aspect=width / height,
-                scale=FRUSTUM_SHARE * self.radius, thickness=0.002 * self.radius,
-                color=STAGE_COLOURS[stage.key], image=_thumbnail(image), format="jpeg", wxyz=poses[view],
-                position=places[view], cast_shadow=False,
+                f"{layer.name}/cameras/{view:03d}", fov=field_of_view(stage, view), aspect=width / height, scale=scale,
+                thickness=0.002 * self.radius, color=colour, image=_thumbnail(images[view]), format="jpeg",
+                wxyz=poses[view], position=places[view], cast_shadow=False,
             )  # fmt: skip
             handle.on_click(lambda _, view=view: self._set_follow(view))
             yield handle
+        if len(places) > MOST_CAMERAS:
+            ends = np.stack((places[:-1], places[1:]), axis=1)
+            yield self.server.scene.add_line_segments(f"{layer.name}/path", ends, colour, thickness=0.004 * self.radius)
 
     def _add_controls(self) -> None:
         gui = self.server.gui
@@ -152,8 +158,7 @@ class Viewer:
         self.with_points = gui.add_checkbox("Points", True)
         self.with_cameras = gui.add_checkbox("Cameras", True)
         self.with_mesh = gui.add_checkbox("Mesh", False, visible=bool(self.meshes))
-        choices = [OUTSIDE, *(f"{view + 1}: {name}" for view, name in enumerate(self.names))]
-        self.follow = gui.add_dropdown("Follow camera", choices, initial_value=OUTSIDE)
+        self.follow = gui.add_dropdown("Follow camera", _choices(self.layers[0].result), initial_value=OUTSIDE)
         picture = gui.add_button("Save screenshot")
         for control in (self.shown, self.size, self.hidden, self.with_points, self.with_cameras, self.with_mesh):
             control.on_update(lambda _: self._apply())
@@ -169,6 +174,10 @@ class Viewer:
     def _apply(self) -> None:
         """Update the scene from the controls."""
         chosen = self._layer()
+        choices = _choices(chosen.result)
+        if list(self.follow.options) != choices:
+            # Another piece, with frames of its own.
+            self.follow.options = choices
         first_band = round(self.hidden.value / 100 * BANDS)
         # Seen from one of the cameras, frusta and their pictures would hide the points.
         cameras = self.with_cameras.value and self.follow.value == OUTSIDE
@@ -228,7 +237,8 @@ def open_viewer(folders: Sequence[Path], *, host: str = "127.0.0.1", port: int) 
     """Serve one or two output folders of the same photos; returns at once, the server runs in a thread of its own.
 
     Args:
-        folders: output folders; the second is moved and scaled onto the first.
+        folders: output folders; the second is moved and scaled onto the first. Of one folder, the other pieces of a
+            sequence are shown too.
         host: address to listen on. Other than localhost, everybody who reaches it sees the photos. Browsers get the
             scene for the viewer's own page only (`report.origin`).
         port: to listen on.
@@ -246,13 +256,38 @@ def open_viewer(folders: Sequence[Path], *, host: str = "127.0.0.1", port: int) 
     for result in results:
         if not result.has_cameras:
             raise UserError(f"{result.folder}: has no cameras, so there is nothing to show in 3D.")
+    others = sequence.piece_folders(results[0])
     if len(results) == 2:
         if list(results[0].names) != list(results[1].names):
             raise UserError(
                 f"{results[1].folder}: shows other photos than {results[0].folder}; compare runs of one scene."
             )
         results[1] = moved(results[1], onto=results[0].final)
-    return Viewer(results, host=host, port=port)
+        names = _folder_names(results)
+        if others:
+            logger.warning("only the first pieces are compared; view one folder alone to see all of its pieces.")
+    else:
+        results += [_beside(load_result(other), results[0]) for other in others]
+        names = [f"piece {number + 1}" for number in range(len(results))]
+    return Viewer(results, names=names, host=host, port=port)
+
+
+def _beside(piece: Result, first: Result) -> Result:
+    """Return a piece levelled, centred and scaled like the first, as its own frame and scale mean nothing beside it."""
+    (level, centre, radius), (to_level, to_centre, to_radius) = _extent(piece.final), _extent(first.final)
+    scale, R = to_radius / radius, to_level.T @ level
+    s, turn, t = (torch.as_tensor(a, dtype=torch.float64) for a in (scale, R, to_centre - scale * R @ centre))
+    return moved_by(piece, Sim3(s=s, R=turn, t=t))
+
+
+def _extent(stage: Stage) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rotation (3, 3) to a level frame, centre (3,) of the kept points, and a radius that holds most of them."""
+    assert stage.T_cam_world is not None
+    level = level_rotation(stage.T_cam_world)
+    points = stage.world_points()
+    seen = points[stage.keep] if stage.keep.any() else points.reshape(-1, 3)
+    centre = np.quantile(seen @ level.T, (0.03, 0.97), axis=0).mean(axis=0) @ level
+    return level, centre, float(np.quantile(np.linalg.norm(seen - centre, axis=1), 0.9)) or 1.0
 
 
 def require_free_port(host: str, port: int) -> None:
@@ -301,15 +336,22 @@ def camera_poses(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
     return quat_xyzw_to_wxyz(matrix_to_quat_xyzw(R)).numpy(), places
 
 
-def _layers(results: Sequence[Result]) -> list[Layer]:
-    names = _folder_names(results)
-    layers = []
+def _layers(results: Sequence[Result], names: Sequence[str]) -> list[Layer]:
+    layers, photos = [], set()
     for number, (result, name) in enumerate(zip(results, names, strict=True)):
         for stage in result.stages.values():
-            if number == 0 or stage.key != "truth":
+            # Two results of the same photos have one ground truth.
+            if stage.key != "truth" or tuple(result.names) not in photos:
                 label = stage.label if len(results) == 1 else f"{stage.label} ({name})"
                 layers.append(Layer(label=label, name=f"/{number}/{stage.key}", stage=stage, result=result))
+        photos.add(tuple(result.names))
     return layers
+
+
+def _choices(result: Result) -> list[str]:
+    """Where the view can be from: outside, or one of the cameras."""
+    numbers = sequence.view_numbers(result)
+    return [OUTSIDE, *(f"{number}: {name}" for number, name in zip(numbers, result.names, strict=True))]
 
 
 def _folder_names(results: Sequence[Result]) -> list[str]:

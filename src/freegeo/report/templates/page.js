@@ -13,6 +13,22 @@
     if (image.complete) sharpen(image);
     else image.addEventListener("load", () => sharpen(image));
   }
+  const views = [...photos.querySelectorAll(".view")];
+  for (const pager of photos.querySelectorAll(".pager")) {
+    const size = Number(pager.dataset.size), [back, ahead] = pager.querySelectorAll("button");
+    let first = 0;
+    const show = (place) => {
+      first = place;
+      views.forEach((view, k) => { view.hidden = k < first || k >= first + size; });
+      const last = Math.min(first + size, views.length);
+      pager.querySelector("output").textContent = `${first + 1} to ${last} of ${views.length}`;
+      back.disabled = first === 0;
+      ahead.disabled = last === views.length;
+    };
+    back.addEventListener("click", () => show(first - size));
+    ahead.addEventListener("click", () => show(first + size));
+    show(0);
+  }
   const large = document.getElementById("large");
   const body = large.querySelector("div");
   photos.addEventListener("click", (event) => {

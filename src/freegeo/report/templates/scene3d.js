@@ -138,16 +138,23 @@
     context.strokeStyle = getComputedStyle(document.documentElement).getPropertyValue(`--${stage.key}`);
     context.lineWidth = Math.max(1, width / 900);
     context.beginPath();
+    const place = (corner) => {
+      const offset = sub(corner, eye), depth = -dot(offset, back);
+      return depth < near ? null : [width / 2 + focal * dot(offset, right) / depth, height / 2 - focal * dot(offset, up) / depth];
+    };
+    const join = (a, b) => { if (a && b) { context.moveTo(...a); context.lineTo(...b); } };
     for (const corners of stage.cameras) {
-      const placed = corners.map((corner) => {
-        const offset = sub(corner, eye), depth = -dot(offset, back);
-        return depth < near ? null : [width / 2 + focal * dot(offset, right) / depth, height / 2 - focal * dot(offset, up) / depth];
-      });
-      for (const [a, b] of EDGES) {
-        if (placed[a] && placed[b]) { context.moveTo(...placed[a]); context.lineTo(...placed[b]); }
-      }
+      const placed = corners.map(place);
+      for (const [a, b] of EDGES) join(placed[a], placed[b]);
     }
     context.stroke();
+    if (stage.path.length) {
+      const path = stage.path.map(place);
+      context.lineWidth *= 2;
+      context.beginPath();
+      path.slice(1).forEach((end, k) => join(path[k], end));
+      context.stroke();
+    }
   }
 
   let waiting = false;
