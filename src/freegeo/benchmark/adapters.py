@@ -58,6 +58,10 @@ class AdapterJob:
             **self.base,
         })  # fmt: skip
 
+    def __str__(self) -> str:
+        """Dataset and digest as text."""
+        return f"the adapter for {self.dataset} ({self.digest})"
+
     @property
     def digest(self) -> str:
         """Hash of the configuration without the recipe's name, so that equal recipes share an adapter."""
@@ -118,7 +122,7 @@ def train(
 def _warn(job: AdapterJob, trouble: str | None) -> None:
     """Say that an adapter should not be used; its predictions are made and scored all the same."""
     if trouble:
-        logger.warning("the adapter for %s (%s): %s", job.dataset, job.digest, trouble)
+        logger.warning("%s: %s", job, trouble)
 
 
 def use(job: AdapterJob, model: ReconstructionModel, out: Path, epoch: int | None) -> Adapter:

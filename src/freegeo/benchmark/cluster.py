@@ -1,20 +1,22 @@
 """Tasks of a run spread over a ray cluster (extra `cluster`): first the adapters, then the predictions.
 
-All machines must see the folders of data and results. Every worker keeps its model between tasks.
+All machines must see the folders of data and results. Every worker keeps its model between tasks. A task whose worker
+dies is started again; an adaptation continues at its last checkpoint.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache
-from importlib import import_module
+from functools import lru_cache, partial
+from pathlib import Path
 from typing import Any
 
 from freegeo.benchmark.adapters import AdapterJob
 from freegeo.benchmark.predict import Predictor, Setup, adaptation_problem, problem_of
-from freegeo.benchmark.tasks import Problem, Task, run_each
-from freegeo.errors import UserError
+from freegeo.benchmark.tasks import TASK_FILE, Problem, Task, run_each
+from freegeo.errors import FreeGeoError
+from freegeo.pools import RETRIES, Died, RayPool, outcomes
 
 
 def predict_on_cluster(
@@ -24,34 +26,36 @@ def predict_on_cluster(
 
     UserError when ray is not installed, or a stored task was made with other settings.
     """
-    try:
-        ray: Any = import_module("ray")
-    except ImportError:
-        raise UserError("--cluster needs ray: pip install 'freegeo[cluster]'.") from None
-    if not ray.is_initialized():
-        ray.init(log_to_driver=False)
-    resources = {"num_gpus": 1} if predictor.chosen.device.type == "cuda" else {"num_cpus": 1}
     waiting = predictor.unfinished(tasks)
     problems: list[Problem] = []
-    for work, items in ((_adapt, predictor.adapter_jobs(waiting)), (_predict, waiting)):
-        remote = ray.remote(**resources)(work)
-        running = {remote.remote(_local(predictor.setup), item): item for item in items}
-        while running:
-            done, _ = ray.wait(list(running))
-            for reference in done:
-                item = running.pop(reference)
-                problems += ray.get(reference)
-                if isinstance(item, Task):
-                    on_task(item)
+    work = partial(_carry_out, _local(predictor.setup))
+    with RayPool(work, gpu=predictor.chosen.device.type == "cuda") as pool:
+        for job, outcome in outcomes(pool, predictor.adapter_jobs(waiting)):
+            problems += [adaptation_problem(job, _death(outcome))] if isinstance(outcome, Died) else outcome
+        for task, outcome in outcomes(pool, waiting):
+            if isinstance(outcome, Died):
+                outcome = [problem_of("predict")(task, _death(outcome))]
+            elif not outcome and not (task.folder(predictor.setup.out) / TASK_FILE).is_file():
+                outcome = [problem_of("predict")(task, _unseen(predictor.setup.out))]
+            problems += outcome
+            on_task(task)
     return problems
 
 
-def _adapt(setup: Setup, job: AdapterJob) -> list[Problem]:
-    return run_each([job], _worker(_Key(setup)).adapt, adaptation_problem)
+def _death(outcome: Died) -> FreeGeoError:
+    return FreeGeoError(f"its worker died {RETRIES + 1} times, the last time of {outcome.reason}")
 
 
-def _predict(setup: Setup, task: Task) -> list[Problem]:
-    return run_each([task], _worker(_Key(setup)).predict, problem_of("predict"))
+def _unseen(out: Path) -> FreeGeoError:
+    return FreeGeoError(f"a worker wrote it where this machine does not see it; all machines must see {out}")
+
+
+def _carry_out(setup: Setup, item: AdapterJob | Task, again: bool) -> list[Problem]:
+    """Train an adapter or make a prediction, in a worker; what a dead worker left is continued or made anew."""
+    predictor = _worker(_Key(setup))
+    if isinstance(item, AdapterJob):
+        return run_each([item], predictor.adapt, adaptation_problem)
+    return run_each([item], predictor.predict, problem_of("predict"))
 
 
 def _local(setup: Setup) -> Setup:

@@ -39,6 +39,7 @@ TERMINATED = 143
 COMMANDS = {
     "demo": ("freegeo.cli.demo:demo", "Photograph a generated room, adapt to it, score before and after."),
     "run": ("freegeo.cli.run:run", "Photos in, adapted reconstruction out."),
+    "batch": ("freegeo.cli.batch:batch", "Many scenes, each as by run, in several processes or on a ray cluster."),
     "adapt": ("freegeo.cli.adapt:adapt", "Adapt a model to one or several scenes and save the adapter."),
     "reconstruct": ("freegeo.cli.reconstruct:reconstruct", "Reconstruct with a frozen model or a saved adapter."),
     "adapter": ("freegeo.cli.adapter:app", "Fold a saved adapter into the weights of its model."),

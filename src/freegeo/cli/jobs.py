@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from freegeo.cameras.known import KnownCameras
     from freegeo.job import Hooks, Job
     from freegeo.metres import ScaleSource
+    from freegeo.models.api import ReconstructionModel
     from freegeo.types import PhotoLike
 
 logger = logging.getLogger(__name__)
@@ -129,30 +130,17 @@ def run_job(
     from freegeo.job import MATCHES_NAME, PARTS, SUMMARY_NAME, Job
     from freegeo.metres import read_scale
     from freegeo.models.images import look_at_photos, read_photos
-    from freegeo.pipeline import require_enough_photos, require_pose_from, require_reference, scene_images
-    from freegeo.posed import check_known, is_one_camera, require_cameras, told, undistorted_masks
+    from freegeo.pipeline import require_enough_photos, require_reference, scene_images
+    from freegeo.posed import check_known, is_one_camera, told, undistorted_masks
     from freegeo.sequence_job import SEQUENCE_PARTS, SequenceJob
 
     check_place(output)
     check_inputs(output, photos, adapter, cameras.cameras)
     empty = model_options.build_empty()
     formats = files.all_formats(output, photos, has_cameras=empty.spec.cameras)
-    require_pose_from(empty.spec, pose_from)
-    refining = refines_with(cameras, refine) and empty.spec.cameras
-    if refine == "ba" and not refining:
-        raise UserError(f"{empty.spec.name} predicts no cameras, so there are none to refine. Leave --refine out.")
-    if cameras.cameras is not None or placing.scale is not None:
-        require_cameras(empty.spec)
-    if recipe is not None:
-        empty.adaptable()
-    plan = None if recipe is None else recipe.build(empty.spec)
+    plan, refining = planned(empty, recipe, refine=refine, pose_from=pose_from, cameras=cameras, placing=placing)
     if plan is not None:
         require_enough_photos(photos)
-        if plan.cameras and pose_from == "rays":
-            raise UserError(
-                f"recipe {plan.name} teaches the camera head, which --pose-from rays does not read. Leave out one of "
-                "them."
-            )
     if empty.spec.caution:
         logger.warning("%s", empty.spec.caution)
     masks = files.checked_masks(photos)
@@ -257,6 +245,39 @@ def _require_joinable(known: KnownCameras | None, plan: Recipe | None) -> None:
             f"recipe {plan.name} learns from cameras of one chunk, and these are more photos than are predicted at "
             "once. Take recipe scene, or --max-views."
         )
+
+
+def planned(
+    empty: ReconstructionModel,
+    recipe: RecipeOptions | None,
+    *,
+    refine: Refine,
+    pose_from: PoseFrom,
+    cameras: CameraOptions = NO_CAMERAS,
+    placing: PlacingOptions = DEFAULT_PLACING,
+) -> tuple[Recipe | None, bool]:
+    """Return the recipe for a model, if it is to adapt, and whether refinement follows.
+
+    UserError for options that the model has no use for, or that do not go together.
+    """
+    from freegeo.pipeline import require_pose_from
+    from freegeo.posed import require_cameras
+
+    require_pose_from(empty.spec, pose_from)
+    refining = refines_with(cameras, refine) and empty.spec.cameras
+    if refine == "ba" and not refining:
+        raise UserError(f"{empty.spec.name} predicts no cameras, so there are none to refine. Leave --refine out.")
+    if cameras.cameras is not None or placing.scale is not None:
+        require_cameras(empty.spec)
+    if recipe is None:
+        return None, refining
+    empty.adaptable()
+    plan = recipe.build(empty.spec)
+    if plan.cameras and pose_from == "rays":
+        raise UserError(
+            f"recipe {plan.name} teaches the camera head, which --pose-from rays does not read. Leave out one of them."
+        )
+    return plan, refining
 
 
 def placing_settings(

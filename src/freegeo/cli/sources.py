@@ -80,20 +80,21 @@ def demo_scene(room: int, domain: str) -> Scene:
 def split_scenes(sources: Sequence[str]) -> list[list[str]]:
     """Tell scenes apart: photo files together are one scene, every folder, pattern or video is one of its own.
 
-    A pattern that fits folders stands for these folders.
+    A pattern that fits folders or videos, and nothing else, stands for these.
     """
     require_sources(sources)
-    named = [name for source in sources for name in _folders_of_pattern(source) or [source]]
+    named = [name for source in sources for name in _scenes_of_pattern(source) or [source]]
     files = [source for source in named if _is_photo_file(source)]
     scenes = [[source] for source in named if source not in files]
     return [files, *scenes] if files else scenes
 
 
-def _folders_of_pattern(source: str) -> list[str]:
-    """Return the folders that a pattern fits; nothing when it fits anything else."""
+def _scenes_of_pattern(source: str) -> list[str]:
+    """Return the folders and videos that a pattern fits; nothing when it fits anything else."""
     from freegeo.data.photos import matching
+    from freegeo.data.video import is_video
 
     if not has_magic(source) or Path(source).expanduser().exists():
         return []
     matches = matching(source)
-    return [str(match) for match in matches] if all(match.is_dir() for match in matches) else []
+    return [str(match) for match in matches] if all(match.is_dir() or is_video(match) for match in matches) else []
