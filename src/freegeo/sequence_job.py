@@ -22,6 +22,7 @@ from freegeo.adaptation.views import chunk_windows
 from freegeo.data.video import VideoFrame
 from freegeo.errors import FreeGeoError, LostFolderError, UserError
 from freegeo.evidence.candidate import Candidate
+from freegeo.evidence.matches import find_matches
 from freegeo.export.base import KEPT_NAME
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import Reconstruction, Scale, save_streamed
@@ -229,7 +230,7 @@ class SequenceJob(Job):
                     photos=[self.photos[i] for i in own], batch=self.batch.select(own).read,
                     frozen=partial(Reconstruction.load, place / FROZEN_FOLDER),
                     priors=None if self.priors is None else self.priors.select(own), store=place / MATCHES_NAME,
-                    name=f"chunk {number + 1}", frames=chunk.frames,
+                    name=f"chunk {number}", frames=chunk.frames,
                 )
             )  # fmt: skip
         judge_by_photos(
@@ -244,7 +245,7 @@ class SequenceJob(Job):
         assert self.photos is not None
         frames = list(chunk.frames)
         name = _loop_name(chunk) if number is None else _chunk_name(number)
-        label = f"chunk {number + 1} of {count}, frames {chunk}" if number is not None else f"loop of frames {chunk}"
+        label = f"chunk {number} (frames {chunk}), {number + 1} of {count}" if number is not None else f"loop of frames {chunk}"
         values = {f.name: getattr(self, f.name) for f in fields(Job)}
         values |= {
             "batch": self.batch.select(frames), "photos": [self.photos[i] for i in frames],
@@ -265,7 +266,7 @@ class SequenceJob(Job):
             raise
         except FreeGeoError as error:
             self.failed[number] = str(error)
-            self._warn(f"Chunk {number + 1} (frames {chunks[number]}) is left out: {error}")
+            self._warn(f"Chunk {number} (frames {chunks[number]}) is left out: {error}")
 
     def _loops(self) -> tuple[list[Loop], list[Chunk]]:
         """Look for places that the sequence comes back to: what was found, and a chunk for each one that holds."""
@@ -287,13 +288,15 @@ class SequenceJob(Job):
 
     def _refuted(self, chunk: Chunk, loop: Loop) -> str | None:
         """Predict the frames around both ends of a loop together; returns why that cannot be used."""
+        assert self.photos is not None
         try:
             found = self._job(chunk).make().result
         except (UserError, LostFolderError):
             raise
         except FreeGeoError as error:
             return str(error)
-        return agrees(Candidate.of(found, str(self.compute.device)), chunk.frames, loop).reason
+        matches = find_matches([self.photos[frame] for frame in loop.frames])
+        return agrees(Candidate.of(found, str(self.compute.device)), chunk.frames, loop, matches).reason
 
     @property
     def _is_placed(self) -> bool:

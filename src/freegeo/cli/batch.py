@@ -332,7 +332,7 @@ class _Table:
         from freegeo.job import SUMMARY_NAME
         from freegeo.pools import RETRIES, Died
         from freegeo.report.overview import SceneRow, outcome_of
-        from freegeo.report.page import FILE_NAME
+        from freegeo.report.result import REPORT_NAME
 
         folder = self.out / work.scene.name
         about: dict[str, Any] = {
@@ -351,7 +351,7 @@ class _Table:
         return SceneRow(
             **about, outcome=INCOMPLETE if partial_result else outcome_of(summary), views=len(summary["images"]),
             seconds=round(sum(summary["seconds"].values()), 1), warnings=len(summary["warnings"]),
-            report=f"{work.scene.name}/{FILE_NAME}", error=_reason(work.log) if partial_result else None,
+            report=f"{work.scene.name}/{REPORT_NAME}", error=_reason(work.log) if partial_result else None,
             asked=self._stamp(work),
         )  # fmt: skip
 
