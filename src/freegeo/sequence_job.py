@@ -245,7 +245,11 @@ class SequenceJob(Job):
         assert self.photos is not None
         frames = list(chunk.frames)
         name = _loop_name(chunk) if number is None else _chunk_name(number)
-        label = f"chunk {number} (frames {chunk}), {number + 1} of {count}" if number is not None else f"loop of frames {chunk}"
+        label = (
+            f"chunk {number} (frames {chunk}), {number + 1} of {count}"
+            if number is not None
+            else f"loop of frames {chunk}"
+        )
         values = {f.name: getattr(self, f.name) for f in fields(Job)}
         values |= {
             "batch": self.batch.select(frames), "photos": [self.photos[i] for i in frames],

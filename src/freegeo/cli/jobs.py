@@ -41,7 +41,8 @@ if TYPE_CHECKING:
     from freegeo.job import Hooks, Job
     from freegeo.metres import ScaleSource
     from freegeo.models.api import ReconstructionModel
-    from freegeo.types import PhotoLike
+    from freegeo.models.images import Frames
+    from freegeo.types import ImageBatch, PhotoLike
 
 logger = logging.getLogger(__name__)
 
@@ -125,7 +126,6 @@ def run_job(
     """
     from freegeo.adaptation.adapt import require_unchanged_images
     from freegeo.cameras.undistortion import UndistortedPhoto
-    from freegeo.data.photos import some_of
     from freegeo.data.video import VideoFrame
     from freegeo.job import MATCHES_NAME, PARTS, SUMMARY_NAME, Job
     from freegeo.metres import read_scale
@@ -146,25 +146,18 @@ def run_job(
     masks = files.checked_masks(photos)
     photos, known = cameras.read(photos)
     masks = undistorted_masks(masks, photos)
-    scale = None if placing.scale is None else read_scale(placing.scale, photos)
-    one_camera = is_one_camera(photos) if placing.one_camera is None else placing.one_camera
     pieces = sequence.plan(empty, photos, mixed, model_options.compute())
     if pieces is None:
-        batch = read_photos(empty, photos, mixed=mixed)
+        batch: ImageBatch = read_photos(empty, photos, mixed=mixed)
     else:
         _require_joinable(known, plan)
-        batch = look_at_photos(empty, photos, mixed=mixed)
-        shown = batch.shown()
-        if len(shown) < len(photos):
-            blank = sorted(set(range(len(photos))) - set(shown))
-            logger.warning(
-                "%d of %d photos are almost black, white or of one colour, and are left out of the chunks: %s.",
-                len(blank), len(photos), some_of([photos[view].name for view in blank]),
-            )  # fmt: skip
-            batch, photos = batch.select(shown), [photos[view] for view in shown]
-            known = None if known is None else known.select(shown)
-            masks = None if masks is None else [masks[view] for view in shown]
-            scale = None if placing.scale is None else read_scale(placing.scale, photos)
+        frames = look_at_photos(empty, photos, mixed=mixed)
+        shown = _shown(frames)
+        batch, photos = frames.select(shown), [photos[view] for view in shown]
+        known = None if known is None else known.select(shown)
+        masks = None if masks is None else [masks[view] for view in shown]
+    scale = None if placing.scale is None else read_scale(placing.scale, photos)
+    one_camera = is_one_camera(photos) if placing.one_camera is None else placing.one_camera
     priors, sentence = told(known, batch, empty.spec)
     if sentence:
         console.note(sentence)
@@ -231,6 +224,20 @@ def run_job(
         summary = job.run()
         describe(summary, output.output)
     require_complete(output.output, summary["not_written"], summary.get("sequence"))
+
+
+def _shown(frames: Frames) -> list[int]:
+    """Return the photos of a sequence that show something, and say which ones are left out."""
+    from freegeo.data.photos import some_of
+
+    shown = frames.shown()
+    blank = [name for view, name in enumerate(frames.names) if view not in set(shown)]
+    if blank:
+        logger.warning(
+            "%d of %d photos are almost black, white or of one colour, and are left out: %s.",
+            len(blank), len(frames), some_of(blank),
+        )  # fmt: skip
+    return shown
 
 
 def _require_joinable(known: KnownCameras | None, plan: Recipe | None) -> None:
