@@ -116,10 +116,11 @@ def sequence_of(frames: int, *, cut: int | None = None, missing: int | None = No
         "first": frames // 8, "second": frames // 2, "similarity": 0.962, "matches": 9, "used": False,
         "reason": "Only 9 of 431 matches agree with one motion of the camera.",
     })  # fmt: skip
-    pieces = []
+    pieces, taken = [], set()
     for number in range(piece + 1):
         own = [c for c in chunks if c["piece"] == number]
-        span = sorted({frame for c in own for frame in range(c["first"], c["last"] + 1)})
+        span = sorted({frame for c in own for frame in range(c["first"], c["last"] + 1)} - taken)
+        taken.update(span)
         folder = f"pieces/{number + 1}" if number else "."
         pieces.append({"folder": folder, "first": span[0], "last": span[-1], "frames": len(span)})
     return {
