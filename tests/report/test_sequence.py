@@ -52,7 +52,7 @@ def test_the_page_names_the_seam_that_failed_and_leads_to_the_other_pieces(folde
         text = (folder / "report.html").read_text(encoding="utf-8")
         top = text[: text.index("<main>")]
         assert "This result is in 2 pieces" in top
-        assert "Chunks 3 and 4 (frames 48 to 71, and frames 64 to 87) could not be joined. Only 12 % of" in top
+        assert "Chunks 3 and 4 (frames 48 to 71, and frames 64 to 87) could not be joined: only 12 % of" in top
         assert f"{there}</b>: this page" in top
         (link,) = re.findall('href="([^"]*)"', top)
         assert (folder / link).resolve() == (other / "report.html").resolve()
@@ -66,7 +66,7 @@ def test_a_missing_chunk_and_a_bridge_are_told(tmp_path):
         for name, fault in (("missing", {"frames": FRAMES, "missing": 3}), ("bridged", {"frames": FRAMES, "unused": 4}))
     )
     told = sequence.told(missing)
-    assert told.problems == ["Chunk 3 (frames 48 to 71) is missing. Its frames are black."]
+    assert told.problems == ["Chunk 3 (frames 48 to 71) is missing: its frames are black."]
     assert [piece.link for piece in told.pieces] == [None, None]
     assert told.pieces[1].name == "piece 2, frames 64 to 119, in pieces/2"
     told = sequence.told(bridged)
@@ -83,7 +83,7 @@ def test_seams_of_loops_and_chunks_without_a_seam_are_told(pieces):
     assert "5 seams, all used." in told.sentences and "1 seam of loops could not be used." in told.sentences
     assert told.seams.rows[0].cells[0] == "1–9, loop" and not told.seams.rows[0].is_used
     assert told.problems == [
-        "Chunks 3 and 4 (frames 48 to 71, and frames 64 to 87) could not be joined. They share no frames."
+        "Chunks 3 and 4 (frames 48 to 71, and frames 64 to 87) could not be joined: they share no frames."
     ]
 
 

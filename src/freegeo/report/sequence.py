@@ -211,7 +211,7 @@ def _problems(sequence: Mapping[str, Any]) -> list[str]:
     piece_of = {chunk["number"]: chunk["piece"] for chunk in sequence["chunks"]}
     frames_of = {c["number"]: f"frames {c['first']} to {c['last']}" for c in sequence["chunks"]}
     found = [
-        f"Chunk {chunk['number']} ({frames_of[chunk['number']]}) is missing. {chunk['reason'] or ''}".strip()
+        f"Chunk {chunk['number']} ({frames_of[chunk['number']]}) is missing{_because(chunk['reason'])}"
         for chunk in sequence["chunks"]
         if chunk["piece"] is None
     ]
@@ -220,11 +220,15 @@ def _problems(sequence: Mapping[str, Any]) -> list[str]:
     for a, b in sorted({*neighbours, *(pair for pair, seam in seam_of.items() if not seam["used"])}):
         ends, seam = (piece_of.get(a), piece_of.get(b)), seam_of.get((a, b))
         if None not in ends and ends[0] != ends[1]:
-            why = "They share no frames." if seam is None else seam["reason"] or ""
-            found.append(f"Chunks {a} and {b} ({frames_of[a]}, and {frames_of[b]}) could not be joined. {why}".strip())
+            why = _because("they share no frames." if seam is None else seam["reason"])
+            found.append(f"Chunks {a} and {b} ({frames_of[a]}, and {frames_of[b]}) could not be joined{why}")
     if len(found) > MOST_NAMED:
         found[MOST_NAMED:] = [f"So it is at {len(found) - MOST_NAMED} more places; see the seams below."]
     return found
+
+
+def _because(reason: str | None) -> str:
+    return f": {reason}" if reason else "."
 
 
 def _piece_number(folder: Path, sequence: Mapping[str, Any]) -> int:
