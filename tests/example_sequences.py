@@ -93,7 +93,7 @@ def sequence_of(frames: int, *, cut: int | None = None, missing: int | None = No
         first, last = number * step, min(number * step + CHUNK, frames) - 1
         gone, apart = number == missing, number in (cut, None if missing is None else missing + 1)
         piece += apart
-        reason = "Its frames are black." if gone else None
+        reason = "its frames are black." if gone else None
         chunks.append({
             "number": number, "first": first, "last": last, "frames": last - first + 1,
             "piece": None if gone else piece, "reason": reason, "refined": None if gone else number % 3 > 0,
@@ -105,7 +105,7 @@ def sequence_of(frames: int, *, cut: int | None = None, missing: int | None = No
             "first": number - 1, "second": number, "frames": OVERLAP, "kind": "neighbours",
             "inliers": 0.9 - 0.01 * (number % 7) if used else 0.12, "rms": 0.01 + 0.002 * (number % 5),
             "scale": 1 + 0.01 * (number % 4), "gap": 0.008 if used else None, "used": used,
-            "reason": None if used else "Only 12 % of the pixels that both chunks see agree.",
+            "reason": None if used else "only 12 % of the pixels that both chunks see agree.",
         })  # fmt: skip
     if unused is not None:
         seams.append(
@@ -116,10 +116,11 @@ def sequence_of(frames: int, *, cut: int | None = None, missing: int | None = No
         "first": frames // 8, "second": frames // 2, "similarity": 0.962, "matches": 9, "used": False,
         "reason": "Only 9 of 431 matches agree with one motion of the camera.",
     })  # fmt: skip
-    pieces = []
+    pieces, taken = [], set()
     for number in range(piece + 1):
         own = [c for c in chunks if c["piece"] == number]
-        span = sorted({frame for c in own for frame in range(c["first"], c["last"] + 1)})
+        span = sorted({frame for c in own for frame in range(c["first"], c["last"] + 1)} - taken)
+        taken.update(span)
         folder = f"pieces/{number + 1}" if number else "."
         pieces.append({"folder": folder, "first": span[0], "last": span[-1], "frames": len(span)})
     return {

@@ -30,7 +30,7 @@ def pieces(folders):
 def test_every_view_is_called_by_its_frame(pieces):
     step = CHUNK - OVERLAP
     assert sequence.frames_of(pieces[0]) == list(range((CUT - 1) * step + CHUNK))
-    assert sequence.frames_of(pieces[1]) == list(range(CUT * step, FRAMES))
+    assert sequence.frames_of(pieces[1]) == list(range((CUT - 1) * step + CHUNK, FRAMES))
     for piece in pieces:
         numbers = sequence.view_numbers(piece)
         assert [f"frame_{int(number.removeprefix('frame ')):05d}.jpg" for number in numbers] == list(piece.names)
@@ -48,11 +48,11 @@ def test_an_ordinary_result_says_nothing_of_sequences(tmp_path):
 
 
 def test_the_page_names_the_seam_that_failed_and_leads_to_the_other_pieces(folders):
-    for folder, other, there in zip(folders, reversed(folders), ("frames 0 to 71", "frames 64 to 119"), strict=True):
+    for folder, other, there in zip(folders, reversed(folders), ("frames 0 to 71", "frames 72 to 119"), strict=True):
         text = (folder / "report.html").read_text(encoding="utf-8")
         top = text[: text.index("<main>")]
         assert "This result is in 2 pieces" in top
-        assert "Chunks 3 and 4 (frames 48 to 71, and frames 64 to 87) could not be joined. Only 12 % of" in top
+        assert "Chunks 3 and 4 (frames 48 to 71, and frames 64 to 87) could not be joined: only 12 % of" in top
         assert f"{there}</b>: this page" in top
         (link,) = re.findall('href="([^"]*)"', top)
         assert (folder / link).resolve() == (other / "report.html").resolve()
@@ -66,12 +66,25 @@ def test_a_missing_chunk_and_a_bridge_are_told(tmp_path):
         for name, fault in (("missing", {"frames": FRAMES, "missing": 3}), ("bridged", {"frames": FRAMES, "unused": 4}))
     )
     told = sequence.told(missing)
-    assert told.problems == ["Chunk 3 (frames 48 to 71) is missing. Its frames are black."]
+    assert told.problems == ["Chunk 3 (frames 48 to 71) is missing: its frames are black."]
     assert [piece.link for piece in told.pieces] == [None, None]
     assert told.pieces[1].name == "piece 2, frames 64 to 119, in pieces/2"
     told = sequence.told(bridged)
     assert (told.problems, told.pieces) == ([], [])
-    assert "1 of 7 seams could not be used; 1 gap bridged by a chunk farther on." in told.sentences
+    assert "1 of 7 seams could not be used; 1 of them is bridged by others." in told.sentences
+
+
+def test_seams_of_loops_and_chunks_without_a_seam_are_told(pieces):
+    found = pieces[0]
+    content = found.summary["sequence"]
+    refused = {**content["seams"][0], "first": 1, "second": 9, "kind": "loop", "used": False, "reason": "It is apart."}
+    seams = [refused, *(seam for seam in content["seams"] if seam["second"] != CUT)]
+    told = sequence.told(replace(found, summary={"sequence": {**content, "seams": seams}}))
+    assert "5 seams, all used." in told.sentences and "1 seam of loops could not be used." in told.sentences
+    assert told.seams.rows[0].cells[0] == "1–9, loop" and not told.seams.rows[0].is_used
+    assert told.problems == [
+        "Chunks 3 and 4 (frames 48 to 71, and frames 64 to 87) could not be joined: they share no frames."
+    ]
 
 
 def test_what_is_drawn_lies_at_its_frames(pieces):
@@ -81,8 +94,8 @@ def test_what_is_drawn_lies_at_its_frames(pieces):
         assert sorted(set(rows)) == list(range(len(piece.names)))
         assert all(a[1][-1] == b[1][0] for a, b in zip(course.parts, course.parts[1:], strict=False))
     assert [number for number, _ in second.parts] == [4, 5, 6]
-    # Frame 67 is in the middle of the frames 64 to 71 that the chunks share.
-    assert (67, False, "3–4") in first.seams and (67 - 64, False, "3–4") in second.seams
+    # Frame 67 is in the middle of the frames 64 to 71 that the chunks share, and in the first piece only.
+    assert (67, False, "3–4") in first.seams and (0, False, "3–4") in second.seams
     assert first.loops == [(15, 60, False)] and second.loops == []
     drawing = trajectory(pieces[0], first)
     assert all(colour in drawing for colour in ("var(--chunk0)", "var(--chunk3)", "var(--doubt)", ">3–4<"))
@@ -90,11 +103,13 @@ def test_what_is_drawn_lies_at_its_frames(pieces):
 
 def test_views_of_unknown_frames_keep_their_numbers(folders):
     found = load_result(folders[0])
-    content = {**found.summary["sequence"], "chunks": found.summary["sequence"]["chunks"][:2]}
+    content = found.summary["sequence"]
+    content = {**content, "chunks": [{**chunk, "last": chunk["first"] + 9} for chunk in content["chunks"]]}
     odd = replace(found, summary={**found.summary, "sequence": content})
     assert sequence.frames_of(odd) is None
     assert sequence.view_numbers(odd)[0] == "1"
-    assert "could not be joined" not in page.render(odd) and 'id="sequence"' in page.render(odd)
+    text = page.render(odd)
+    assert 'id="sequence"' in text and "path of the cameras" not in text
 
 
 def test_long_tables_begin_with_what_is_bad():

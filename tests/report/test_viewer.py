@@ -107,9 +107,9 @@ def test_pieces_are_chosen_one_at_a_time(tmp_path):
         shown.follow.value = shown.follow.options[3]
         shown.shown.value = "frozen (piece 2)"
         assert shown.follow.value == viewer.OUTSIDE
-        assert shown.follow.options[1] == "frame 64: frame_00064.jpg"
+        assert shown.follow.options[1] == "frame 72: frame_00072.jpg"
         assert visible(shown.bands[first]) == 0 and visible(shown.bands[second]) == viewer.BANDS
-        # Of the 116 cameras, 100 and the line through all of them.
+        # Of the 108 cameras, 100 and the line through all of them.
         assert visible(shown.frusta[second]) == viewer.MOST_CAMERAS + 1
         # Both are shown level, in the same place and at the same size.
         extents = [viewer._extent(layer.stage) for layer in shown.layers]

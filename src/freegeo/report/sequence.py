@@ -109,8 +109,12 @@ def frames_of(result: Result) -> list[int] | None:
     sequence = result.summary.get("sequence")
     if not sequence:
         return None
-    piece = _piece_number(result.folder, sequence)
-    frames = sorted({frame for chunk in _chunks(sequence, piece) for frame in _range(chunk)})
+    taken: set[int] = set()
+    frames: list[int] = []
+    for piece in range(_piece_number(result.folder, sequence) + 1):
+        # A frame of two pieces is in the first of them.
+        frames = sorted({frame for chunk in _chunks(sequence, piece) for frame in _range(chunk)} - taken)
+        taken.update(frames)
     return frames if len(frames) == len(result.names) else None
 
 
@@ -132,7 +136,8 @@ def course(result: Result) -> Course | None:
     seams = []
     for seam in sequence["seams"]:
         pair = [chunk_of[number] for number in (seam["first"], seam["second"]) if number in chunk_of]
-        if seam["kind"] != "loop" and len(pair) == 2 and any(chunk in own for chunk in pair):
+        is_shown = seam["kind"] == "neighbours" or not seam["used"]
+        if is_shown and len(pair) == 2 and any(chunk in own for chunk in pair):
             place = row[min(frames, key=lambda frame: abs(frame - _middle(*pair)))]
             seams.append((place, bool(seam["used"]), f"{seam['first']}–{seam['second']}"))
     loops = [
@@ -167,7 +172,7 @@ def _range(chunk: Mapping[str, Any]) -> range:
 
 def _sentences(sequence: Mapping[str, Any]) -> list[str]:
     chunks, seams, loops, pieces = (sequence[key] for key in ("chunks", "seams", "loops", "pieces"))
-    order = {"given": "in the order given", "similarity": "put in order by what they show"}[sequence["order"]]
+    order = "in the order given" if sequence["order"] == "given" else "put in order by what they show"
     found = [
         f"{_count(sequence['frames'], 'frame')}, {order}, predicted in {_count(len(chunks), 'chunk')} of up to "
         f"{sequence['chunk']} frames; neighbours share {_count(sequence['overlap'], 'frame')}."
@@ -175,24 +180,30 @@ def _sentences(sequence: Mapping[str, Any]) -> list[str]:
     refined = [chunk["refined"] for chunk in chunks if chunk.get("refined") is not None]
     if refined:
         found.append(f"{sum(refined)} of {_count(len(refined), 'chunk')} refined.")
-    unused = sum(not seam["used"] for seam in seams)
-    bridges = sum(seam["kind"] == "bridge" and seam["used"] for seam in seams)
-    if not seams:
-        found.append("There is no seam.")
-    elif unused:
-        found.append(
-            f"{unused} of {_count(len(seams), 'seam')} could not be used"
-            + (f"; {_count(bridges, 'gap')} bridged by a chunk farther on." if bridges else ".")
-        )
-    else:
-        found.append(f"{len(seams)} seams, all used." if len(seams) > 1 else "1 seam, used.")
+    found.append(_seam_sentence(sequence))
     used = sum(bool(loop["used"]) for loop in loops)
+    refused = sum(seam["kind"] == "loop" and not seam["used"] for seam in seams)
     if loops:
         found.append(f"{used} of {_count(len(loops), 'loop')} (places seen twice) used.")
     else:
         found.append("No loops (places seen twice).")
+    if refused:
+        found.append(f"{_count(refused, 'seam')} of loops could not be used.")
     found.append("One piece." if len(pieces) == 1 else f"{len(pieces)} pieces.")
     return found
+
+
+def _seam_sentence(sequence: Mapping[str, Any]) -> str:
+    seams = [seam for seam in sequence["seams"] if seam["kind"] != "loop"]
+    unused = [seam for seam in seams if not seam["used"]]
+    if not seams:
+        return "There is no seam."
+    if not unused:
+        return f"{len(seams)} seams, all used." if len(seams) > 1 else "1 seam, used."
+    piece_of = {chunk["number"]: chunk["piece"] for chunk in sequence["chunks"]}
+    bridged = sum(piece_of[seam["first"]] == piece_of[seam["second"]] for seam in unused)
+    more = f"; {bridged} of them {'is' if bridged == 1 else 'are'} bridged by others" if bridged else ""
+    return f"{len(unused)} of {_count(len(seams), 'seam')} could not be used{more}."
 
 
 def _problems(sequence: Mapping[str, Any]) -> list[str]:
@@ -200,21 +211,24 @@ def _problems(sequence: Mapping[str, Any]) -> list[str]:
     piece_of = {chunk["number"]: chunk["piece"] for chunk in sequence["chunks"]}
     frames_of = {c["number"]: f"frames {c['first']} to {c['last']}" for c in sequence["chunks"]}
     found = [
-        f"Chunk {chunk['number']} ({frames_of[chunk['number']]}) is missing. {chunk['reason'] or ''}".strip()
+        f"Chunk {chunk['number']} ({frames_of[chunk['number']]}) is missing{_because(chunk['reason'])}"
         for chunk in sequence["chunks"]
         if chunk["piece"] is None
     ]
-    for seam in sequence["seams"]:
-        ends = [piece_of.get(seam[key]) for key in ("first", "second")]
-        if not seam["used"] and None not in ends and ends[0] != ends[1]:
-            a, b = seam["first"], seam["second"]
-            found.append(
-                f"Chunks {a} and {b} ({frames_of[a]}, and {frames_of[b]}) could not be joined. {seam['reason'] or ''}"
-                .strip()
-            )  # fmt: skip
+    seam_of = {(seam["first"], seam["second"]): seam for seam in sequence["seams"]}
+    neighbours = pairwise(chunk["number"] for chunk in sequence["chunks"])
+    for a, b in sorted({*neighbours, *(pair for pair, seam in seam_of.items() if not seam["used"])}):
+        ends, seam = (piece_of.get(a), piece_of.get(b)), seam_of.get((a, b))
+        if None not in ends and ends[0] != ends[1]:
+            why = _because("they share no frames." if seam is None else seam["reason"])
+            found.append(f"Chunks {a} and {b} ({frames_of[a]}, and {frames_of[b]}) could not be joined{why}")
     if len(found) > MOST_NAMED:
         found[MOST_NAMED:] = [f"So it is at {len(found) - MOST_NAMED} more places; see the seams below."]
     return found
+
+
+def _because(reason: str | None) -> str:
+    return f": {reason}" if reason else "."
 
 
 def _piece_number(folder: Path, sequence: Mapping[str, Any]) -> int:

@@ -87,7 +87,7 @@ class Viewer:
                     self.server.gui.add_markdown(text)
         told = sequence.told(results[0])
         if told is not None:
-            with self.server.gui.add_folder("Sequence"):
+            with self.server.gui.add_folder("Sequence", expand_by_default=bool(told.problems)):
                 self.server.gui.add_markdown("\n\n".join([" ".join(told.sentences), *told.problems]))
         self._add_controls()
         self._apply()
