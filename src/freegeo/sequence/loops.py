@@ -27,8 +27,8 @@ MUTUAL = 3
 """Each frame of a candidate is among so many far frames that are most like the other."""
 SAME_PICTURE = 1e-5
 """Two frames whose similarity is nearer to 1 than this are one picture (a frozen camera, black frames)."""
-FEWEST_PAIRS = 4
-"""So many of the nine pairs of frames across a loop must have verified matches."""
+FEWEST_PAIRS = 2
+"""Each of the two frames must have verified matches with so many of the three around the other one."""
 LEAST_SHARE = 1.0
 """Share of keypoints that match across a loop, over that of neighbours at one end which are about as alike."""
 LARGEST_RATIO, ALWAYS_GOOD_PX = 2.0, 2.0
@@ -46,7 +46,7 @@ class Loop:
     similarity: float
     """Of the frames' descriptors."""
     matches: int
-    """Verified matches across the loop, of all nine pairs of photos together."""
+    """Verified matches of the two frames with the three around the other one, all five pairs together."""
     frames: Sequence[int]
     """The photos that were matched: three around the first frame, then three around the second, ascending."""
     reason: str | None
@@ -130,9 +130,9 @@ def verified(
     """Match the photos around both ends of each candidate; a `Loop` with a reason is refused.
 
     Three frames around each end are matched with each other. They are so far apart that neighbours at one end are about
-    as alike as the two ends. At least `FEWEST_PAIRS` pairs across the loop must have verified matches, and the share of
-    keypoints that match must be as large as between neighbours: in a place that only looks alike, what is the same
-    (a wall, a floor) matches, and everything else does not.
+    as alike as the two ends. Both frames must have verified matches with `FEWEST_PAIRS` of the three frames around the
+    other, and the share of keypoints that match must be as large as between neighbours: in a place that only looks
+    alike, what is the same (a wall, a floor) matches, and everything else does not.
 
     Args:
         candidates: from `loop_candidates`.
@@ -203,26 +203,27 @@ def _verified(
 ) -> Loop:
     first, second, similarity = found
     frames = _around(first, second, _step(descriptors, first, second, similarity), len(photos))
-    evidence = find_matches([photos[frame] for frame in frames], settings=settings)
-    across = _across(evidence.pairs)
-    keypoints = np.diff(evidence.view_start)
-    shares = evidence.counts / keypoints[evidence.pairs].max(1).clip(min=1)
-    share = float(shares[across].max() / shares[~across].max()) if across.any() and not across.all() else float("nan")
+    found_matches = find_matches([photos[frame] for frame in frames], settings=settings)
+    pairs, ends = found_matches.pairs, [frames.index(first), frames.index(second)]
+    across, own = _across(pairs) & np.isin(pairs, ends).any(1), ~_across(pairs)
+    partners = min(int((across & (pairs == end).any(1)).sum()) for end in ends)
+    shares = found_matches.counts / np.diff(found_matches.view_start)[pairs].max(1)
+    share = float(shares[across].max() / shares[own].max()) if across.any() and own.any() else float("nan")
     return Loop(
         first=first,
         second=second,
         similarity=similarity,
-        matches=int(evidence.counts[across].sum()),
+        matches=int(found_matches.counts[across].sum()),
         frames=frames,
-        reason=_refusal(int(across.sum()), share),
+        reason=_refusal(partners, share),
     )
 
 
-def _refusal(pairs: int, share: float) -> str | None:
-    if pairs < FEWEST_PAIRS:
+def _refusal(partners: int, share: float) -> str | None:
+    if partners < FEWEST_PAIRS:
         return (
-            f"Matches verify {pairs} of 9 pairs of photos around the two frames, and it takes {FEWEST_PAIRS}: "
-            "they look alike, and do not show one place."
+            f"One of the two frames has matches with {partners} of 3 photos around the other, and it takes "
+            f"{FEWEST_PAIRS}: they look alike, and do not show one place."
         )
     if np.isnan(share):
         return "The photos around each of the two frames do not match among themselves, so there is nothing to go by."
@@ -247,19 +248,20 @@ def _disagreement(error: float, largest: float) -> str | None:
 
 def _step(descriptors: np.ndarray, first: int, second: int, similarity: float) -> int:
     """Return how far apart neighbours at the ends are about as alike as the ends are, at least 1."""
-    ends = np.array([first, second])
-    for step in range(1, max(1, (second - first) // 4)):
+    ends, largest = np.array([first, second]), max(1, (second - first - 1) // 4)
+    for step in range(1, largest):
         there = np.concatenate((ends - step, ends + step))
         inside = (there >= 0) & (there < len(descriptors))
         if np.median(_alike(descriptors, np.tile(ends, 2)[inside], there[inside])) <= similarity:
             return step
-    return max(1, (second - first) // 4)
+    return largest
 
 
 def _around(first: int, second: int, step: int, count: int) -> tuple[int, ...]:
-    """Three frames around each end, `step` apart, inside the sequence, ascending."""
-    starts = (max(0, first - step), min(second - step, count - 1 - 2 * step))
-    return tuple(start + k * step for start in starts for k in range(3))
+    """Three frames `step` apart at each end, with it and inside the sequence, ascending."""
+    before = first - step if first >= step else first
+    after = second - step if second + step < count else second - 2 * step
+    return tuple(start + k * step for start in (before, after) for k in range(3))
 
 
 def _across(pairs: np.ndarray) -> np.ndarray:
