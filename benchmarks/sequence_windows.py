@@ -56,17 +56,18 @@ def record(file: Path, domain: str, room: int) -> None:
 
 
 def report(file: Path) -> None:
-    """Print the mean change of each arm over walks, and its lowest over chunks."""
+    """Print the mean change of each arm over the walks that have it, and that of the worst chunk."""
     walks: dict[tuple[str, int], dict[str, dict]] = defaultdict(dict)
     for line in map(json.loads, file.read_text().splitlines()):
         walks[line["domain"], line["room"]][line["arm"]] = line
     for arm in ["frozen", *(f"{kind}, {'windows' if inside else 'anywhere'}" for kind, inside in ARMS)]:
-        told = []
+        told, done = [], [walk for walk in walks.values() if arm in walk]
         for metric in METRICS:
-            change = [np.subtract(walk[arm][metric], walk["frozen"][metric]) for walk in walks.values()]
-            value = np.mean([walk["frozen"][metric] for walk in walks.values()] if arm == "frozen" else change)
-            told.append(f"{metric} {value:+.4f} (lowest {np.min(change):+.3f})")
-        print(f"{arm:20}", ", ".join(told))
+            change = [np.subtract(walk[arm][metric], walk["frozen"][metric]) for walk in done]
+            value = np.mean([walk["frozen"][metric] for walk in done] if arm == "frozen" else change)
+            worst = np.max(change) if metric == "abs_rel" else np.min(change)
+            told.append(f"{metric} {value:+.4f} ({worst:+.3f})")
+        print(f"{arm:20} {len(done)} walks:", ", ".join(told))
 
 
 def main() -> None:
