@@ -86,38 +86,22 @@ def test_predictions_from_disk_give_the_verdict_of_predictions_in_memory_to_the_
 
 
 def test_depth_maps_of_one_scene_are_in_memory_at_a_time(adapted, matches):
-    alive: dict[int, weakref.WeakSet] = {number: weakref.WeakSet() for number in range(SCENES)}
-    most = 0
+    made: list[tuple[int, weakref.ref[np.ndarray]]] = []
+    together: list[set[int]] = []
 
     def counted(number: int, found: Reconstruction) -> Reconstruction:
-        # Only arrays of other scenes matter, which nothing should hold any more.
-        nonlocal most
-        holder = _Depth(found.depth_z)
-        alive[number].add(holder)
-        most = max(most, sum(1 for one in alive.values() if any(depth.is_alive for depth in one)))
-        holders.append(holder)
+        made.append((number, weakref.ref(found.depth_z)))
+        together.append({scene for scene, depth in made if depth() is not None})
         return found
 
-    holders: list[_Depth] = []
     predict = Predictor(adapted.adapter, {n: lambda found, n=n: counted(n, found) for n in range(SCENES)})
     scenes = [
         evidence(number, matches, frozen=lambda number=number: counted(number, turned_room(WRONG, number)))
         for number in range(SCENES)
     ]
     judge_adapter(adapted, scenes, predict, device="cpu", select=True)
-    assert len(holders) == SCENES * (3 + 3), "each frozen prediction three times, and three states"
-    assert most == 1
-
-
-class _Depth:
-    """Says whether a depth map is still held by anyone."""
-
-    def __init__(self, depth_z: np.ndarray):
-        self._depth = weakref.ref(depth_z)
-
-    @property
-    def is_alive(self) -> bool:
-        return self._depth() is not None
+    assert len(made) == SCENES * (3 + 3), "each frozen prediction three times, and three states"
+    assert {len(scenes) for scenes in together} == {1}
 
 
 def collapsed(found: Reconstruction) -> Reconstruction:

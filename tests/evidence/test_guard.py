@@ -259,6 +259,18 @@ def test_of_many_chunks_some_choose_the_state_and_all_confirm_it():
     assert [trial.state for trial in found.trials] == [found.chosen.state]
 
 
+def test_all_chunks_may_be_sure_of_what_some_are_not():
+    count = SCENES + 8
+    choosing = {round(place) for place in np.linspace(0, count - 1, SCENES)}
+    half = np.where(np.arange(len(matches().pairs)) % 2, 1.7, 2.25)
+
+    references = [Scored(seed=seed) for seed in range(count)]
+    alone = scored(lambda number, state: half, [references[number] for number in sorted(choosing)])
+    assert alone.outcome == "frozen"
+    assert 0.5 < alone.trials[0].probability < GuardSettings().probability
+    assert scored(lambda number, state: half if number in choosing else 1.0, references).outcome == "adapted"
+
+
 def test_what_the_other_chunks_do_not_confirm_is_not_used():
     count = SCENES + 24
     choosing = {round(place) for place in np.linspace(0, count - 1, SCENES)}

@@ -132,7 +132,7 @@ class Footprint:
         teacher, learning = self._teacher(sample), self._learning(checkpointing)
         resident = [("weights", self.shape.parameters * WIDE), ("adapter and optimiser", 4 * WIDE * self.trained)]
         waiting = kept if place == "device" else sample
-        if place == "device":
+        if place == "device" or self.compute.device.type == "cpu":
             resident.append(("tokens of shared images", self._shared_tokens()))
         # `teacher` counts the sample that its pass makes, which is therefore not counted among those kept.
         if teacher - sample > sum(size for _, size in learning):

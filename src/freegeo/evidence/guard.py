@@ -27,6 +27,8 @@ SHARES = (0.25, 0.5, 0.75)
 SCENES = 12
 """Most scenes, or chunks of a sequence, on which all states are tried. Of more, an even choice says which state is the
 best, and all of them whether that one is better than the frozen model."""
+CHOOSING = 0.5
+"""Probability of being better, on the even choice, from which a state is looked at on all scenes."""
 _FLOOR_S1, _FLOOR_S2 = 0.05, 0.1
 """Matching pixels below which errors say nothing, added before the logarithm."""
 
@@ -241,25 +243,28 @@ def try_states(
     if missing:
         return Verdict(outcome="unknown", reason=missing, frozen=whole, scenes=len(bases), judged=len(bases))
     look = _Scenes(predict, references)
-    some = _even_choice([number for number in every if _known(bases[number]).any()]) if len(every) > SCENES else every
-    measured, unusable = look.measured(some, states())
-    found = [(state, _together(one, numbers, some)) for state, one in measured.items()]
-    verdict = judge(_together([bases[k] for k in some], numbers, some), found, settings, unusable=unusable)
-    verdict = replace(verdict, scenes=len(every), judged=len(some))
-    if len(some) == len(every):
-        return verdict
+
+    def judged(scenes: Sequence[int], one: Mapping[State, list[Measurement]], lost: Mapping[State, str]) -> Verdict:
+        base = _together([bases[number] for number in scenes], numbers, scenes)
+        found = [(state, _together(each, numbers, scenes)) for state, each in one.items()]
+        probability = settings.probability if len(scenes) == len(every) else CHOOSING
+        verdict = judge(base, found, replace(settings, probability=probability), unusable=lost)
+        return replace(verdict, scenes=len(every), judged=len(scenes))
+
+    if len(every) <= SCENES:
+        return judged(every, *look.measured(every, states()))
+    some = _even_choice([number for number in every if _known(bases[number]).any()])
+    measured, lost = look.measured(some, states())
+    first = judged(some, measured, lost)
     where = f"{len(some)} of {len(every)} {'scenes' if views is None else 'chunks'}"
-    if verdict.chosen is None:
-        return replace(verdict, reason=f"{verdict.reason} This rests on {where}.")
-    best = verdict.chosen.state
+    if first.chosen is None:
+        return replace(first, reason=f"{first.reason} This rests on {where}.")
+    best = first.chosen.state
     rest = [number for number in every if number not in some]
-    more, unusable = look.measured(rest, [best])
-    found = [(best, _together([*measured[best], *one], numbers, [*some, *rest])) for one in more.values()]
-    base = _together([bases[number] for number in (*some, *rest)], numbers, [*some, *rest])
-    verdict = judge(base, found, settings, unusable=unusable)
-    how = "confirmed" if verdict.chosen is not None else "not confirmed"
-    reason = f"{verdict.reason} This is {best}, chosen on {where} and {how} on all."
-    return replace(verdict, reason=reason, scenes=len(every), judged=len(every))
+    more, lost = look.measured(rest, [best])
+    last = judged([*some, *rest], {state: [*measured[state], *each] for state, each in more.items()}, lost)
+    how = "confirmed" if last.chosen is not None else "not confirmed"
+    return replace(last, reason=f"{last.reason} This is {best}, chosen on {where} and {how} on all.")
 
 
 def _frozen_scores(make: Callable[[], Reference]) -> tuple[Measurement, Matches]:
@@ -412,7 +417,8 @@ def _by_pair(values: np.ndarray, frozen: Measurement) -> np.ndarray:
 
 
 def _trial(state: State, measured: Measurement, frozen: Measurement, settings: GuardSettings) -> Trial:
-    fall = _by_pair(_objective(frozen) - _objective(measured), frozen)
+    with np.errstate(invalid="ignore"):  # of pairs without both scores
+        fall = _by_pair(_objective(frozen) - _objective(measured), frozen)
     veto = _veto(measured, frozen, fall, settings)
     gain = spread = float("nan")
     probability = 0.0
