@@ -28,6 +28,7 @@ ALLOWED = {
     "training": {"models", "data", "metrics", "geometry"},
     "adaptation": {"models", "data.scene", "geometry"},
     "evidence": {"export", "fusion", "metrics", "geometry"},
+    "sequence": {"evidence", "models", "fusion", "geometry"},
     "report": {"evidence", "export", "metrics", "geometry"},
     "export": {"data.image_files", "fusion", "geometry"},
     "fusion": {"geometry"},

@@ -1,4 +1,5 @@
 import json
+import math
 
 import numpy as np
 import pytest
@@ -116,3 +117,87 @@ def test_bad_input_is_named():
         align_cameras(poses, poses[:3])
     with pytest.raises(UserError, match="NaN"):
         umeyama(torch.full((4, 3), float("nan")), torch.zeros(4, 3))
+
+
+def wide(seed, scale=1.0):
+    generator = torch.Generator().manual_seed(seed)
+    return random_sim3(generator, 20), scale * torch.randn((20, 7), generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-200, 1e-12, 1e-8, 1e-3, 1.0, math.pi - 1e-9])
+def test_logarithms_and_exponentials_are_inverse(size):
+    """Whatever the angle, from none to almost half a turn."""
+    logarithm = wide(0)[1]
+    axis = logarithm[:, :3] / torch.linalg.vector_norm(logarithm[:, :3], dim=-1, keepdim=True)
+    logarithm = torch.cat((size * axis, logarithm[:, 3:]), dim=-1)
+    torch.testing.assert_close(Sim3.exp(logarithm).log(), logarithm, atol=1e-12, rtol=1e-10)
+
+
+def test_the_exponential_is_that_of_the_matrix():
+    for logarithm in wide(1)[1]:
+        x, y, z, *linear, scale = logarithm.tolist()
+        generator = torch.tensor(
+            [[scale, -z, y, linear[0]], [z, scale, -x, linear[1]], [-y, x, scale, linear[2]], [0, 0, 0, 0]],
+            dtype=torch.float64,
+        )
+        expected, found = torch.linalg.matrix_exp(generator), Sim3.exp(logarithm)
+        torch.testing.assert_close(found.s * found.R, expected[:3, :3])
+        torch.testing.assert_close(found.t, expected[:3, 3])
+
+
+def test_half_turns_come_back():
+    turned = Sim3.exp(torch.tensor([0, math.pi, 0, 1.0, 2.0, 3.0, 0.5], dtype=torch.float64))
+    again = Sim3.exp(turned.log())
+    torch.testing.assert_close(again.R, turned.R)
+    torch.testing.assert_close(again.t, turned.t)
+
+
+def test_logarithms_have_slopes_everywhere():
+    for size in (0.0, 1e-17, 1e-8, 1.0):
+        logarithm = size * torch.ones(7, dtype=torch.float64)
+        slope = torch.autograd.functional.jacobian(lambda step: Sim3.exp(step).log(), logarithm)
+        torch.testing.assert_close(slope, torch.eye(7, dtype=torch.float64), atol=1e-6, rtol=0)
+
+
+def test_the_logarithm_of_the_inverse_is_the_negative():
+    sim3 = wide(2)[0]
+    torch.testing.assert_close(sim3.inverse().log(), -sim3.log())
+
+
+def test_products_apply_one_after_the_other():
+    one, other = wide(3)[0], wide(4)[0]
+    points = wide(5)[1][:, None, :3].expand(20, 6, 3)
+    torch.testing.assert_close((one @ other).apply(points), one.apply(other.apply(points)))
+    torch.testing.assert_close((one @ one.inverse()).log(), torch.zeros(20, 7, dtype=torch.float64))
+    again = Sim3.stack([one[k] for k in range(20)])
+    assert torch.equal(again.t, one.t)
+    assert torch.equal(one[torch.tensor([3, 1])].s, one.s[[3, 1]])
+    assert torch.equal(Sim3.identity().apply(points), points)
+
+
+def test_the_symmetric_scale_is_the_same_from_both_sides():
+    generator = torch.Generator().manual_seed(0)
+    true = random_sim3(generator)
+    x = torch.randn((4000, 3), generator=generator, dtype=torch.float64)
+    y = true.apply(x + 0.3 * torch.randn(x.shape, generator=generator, dtype=torch.float64))
+    x = x + 0.3 * torch.randn(x.shape, generator=generator, dtype=torch.float64)
+    there, back = umeyama(x, y, scale="symmetric"), umeyama(y, x, scale="symmetric")
+    torch.testing.assert_close((there @ back).log(), torch.zeros(7, dtype=torch.float64), atol=1e-10, rtol=0)
+    assert float(there.s / true.s) == pytest.approx(1, abs=0.02)
+    assert float(umeyama(x, y).s / true.s) < 0.95
+
+
+def test_a_rigid_fit_is_the_best_of_all_rigid_ones():
+    generator = torch.Generator().manual_seed(1)
+    true = random_sim3(generator)
+    x = torch.randn((30, 3), generator=generator, dtype=torch.float64)
+    y = true.apply(x) + 0.1 * torch.randn(x.shape, generator=generator, dtype=torch.float64)
+    weights = torch.rand(30, generator=generator, dtype=torch.float64)
+    fit = umeyama(x, y, weights, scale="one")
+
+    def cost(sim3):
+        return float((weights * (y - sim3.apply(x)).square().sum(-1)).sum())
+
+    assert float(fit.s) == 1.0
+    for step in torch.eye(7, dtype=torch.float64)[:6]:
+        assert cost(fit) < min(cost(fit @ Sim3.exp(0.01 * step)), cost(fit @ Sim3.exp(-0.01 * step)))

@@ -16,12 +16,14 @@ from freegeo.errors import FreeGeoError
 from freegeo.geometry.sim3 import Sim3
 from freegeo.sequence.alignment import Seam
 
-__all__ = ["Edge", "Placed", "place"]
+__all__ = ["LEAST_TRUST", "Edge", "Placed", "place"]
 
-KERNEL = 0.05
-"""Disagreement of a robust edge with the others that halves its weight."""
+KERNEL = 0.1
+"""Difference of a robust edge from the result that halves its weight."""
+LEAST_TRUST = 0.2
+"""A robust edge that keeps less of its weight is left out, for even a small pull bends a long chain."""
 _WIDE_KERNEL = 1.0
-_MOST_EVALUATIONS = 100
+_MOST_STEPS = 30
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,9 +67,9 @@ class Placed:
     """Chunks that edges connect, ascending; the pieces ordered by their first chunk."""
     residuals: np.ndarray
     """(edges,) how far each edge is from the result: length of the logarithm of the difference, in which a radian, a
-    shift by `Edge.size` and a factor of e count alike."""
+    shift by `Edge.size` and a factor of e count alike. NaN for an edge between two pieces."""
     trust: np.ndarray
-    """(edges,) weight, 0 to 1, that a robust edge kept; 1 for the others."""
+    """(edges,) weight, 0 to 1, that a robust edge kept, 0 where it was left out; 1 for the others."""
 
 
 def place(count: int, edges: Sequence[Edge], *, fixed_scale: bool = False) -> Placed:
@@ -75,6 +77,7 @@ def place(count: int, edges: Sequence[Edge], *, fixed_scale: bool = False) -> Pl
 
     The first chunk of each piece stays. Without a cycle the edges are chained exactly. Otherwise the sum over edges of
     the squared logarithm of their difference from the result is minimised, with a Cauchy loss of each robust edge.
+    Robust edges that the others contradict are left out, and the rest is placed without them.
 
     Args:
         count: number of chunks.
@@ -97,11 +100,19 @@ def place(count: int, edges: Sequence[Edge], *, fixed_scale: bool = False) -> Pl
             for chunk, sim3 in zip(piece, moved, strict=True):
                 placed[chunk] = sim3
     if not edges:
-        return Placed(sim3=placed, pieces=pieces, residuals=np.zeros(0), trust=np.ones(0))
+        return Placed(sim3=placed, pieces=pieces, residuals=np.zeros(0), trust=np.zeros(0))
     graph = _Graph.of(edges)
-    lengths = torch.linalg.vector_norm(graph.differences(Sim3.stack(placed)), dim=-1)
-    trust = torch.where(graph.robust, 1 / (1 + graph.weight * (lengths / KERNEL).square()), 1.0)
-    return Placed(sim3=placed, pieces=pieces, residuals=lengths.numpy(), trust=trust.numpy())
+    lengths = torch.linalg.vector_norm(graph.differences(*graph.ends(Sim3.stack(placed))), dim=-1).numpy()
+    trust = np.where(graph.robust.numpy(), 1 / (1 + graph.weight.numpy() * (lengths / KERNEL) ** 2), 1.0)
+    kept = trust >= LEAST_TRUST
+    if not kept.all():
+        rest = place(count, [edge for edge, keep in zip(edges, kept, strict=True) if keep], fixed_scale=fixed_scale)
+        piece_of = {chunk: number for number, piece in enumerate(rest.pieces) for chunk in piece}
+        together = np.array([piece_of[edge.first] == piece_of[edge.second] for edge in edges])
+        lengths = torch.linalg.vector_norm(graph.differences(*graph.ends(Sim3.stack(rest.sim3))), dim=-1).numpy()
+        trust[kept], trust[~kept] = rest.trust, 0.0
+        return replace(rest, residuals=np.where(together, lengths, np.nan), trust=trust)
+    return Placed(sim3=placed, pieces=pieces, residuals=lengths, trust=trust)
 
 
 def _order(edge: Edge) -> tuple[bool, float, int, int]:
@@ -166,10 +177,19 @@ class _Graph:
             robust=torch.tensor([edge.robust for edge in edges]),
         )
 
-    def differences(self, placed: Sim3) -> Tensor:
-        """Logarithms (E, 7) of what each edge lacks to the result, about its place of measurement."""
-        between = placed[self.first].inverse() @ placed[self.second]
-        return (self.local.inverse() @ self.measured.inverse() @ between @ self.local).log()
+    def ends(self, placed: Sim3) -> tuple[Sim3, Sim3]:
+        """Where the two chunks of each edge lie."""
+        return placed[self.first], placed[self.second]
+
+    def differences(self, first: Sim3, second: Sim3) -> Tensor:
+        """Logarithms (E, 7) of what each edge lacks to the places of its chunks, about its place of measurement."""
+        return (self.local.inverse() @ self.measured.inverse() @ first.inverse() @ second @ self.local).log()
+
+    def errors(self, first: Sim3, second: Sim3, kernel: float) -> Tensor:
+        """Weighted differences (E, 7), of robust edges so much smaller that their square is the Cauchy loss."""
+        weighted = self.weight.sqrt()[:, None] * self.differences(first, second)
+        square = weighted.square().sum(-1, keepdim=True).clamp(min=1e-300) / kernel**2
+        return torch.where(self.robust[:, None], (square.log1p() / square).sqrt() * weighted, weighted)
 
 
 def _refined(start: Sequence[Sim3], edges: Sequence[Edge], *, fixed_scale: bool) -> list[Sim3]:
@@ -179,44 +199,52 @@ def _refined(start: Sequence[Sim3], edges: Sequence[Edge], *, fixed_scale: bool)
     from the minimum of a wide kernel, which every loop has pulled at; the lower of the two minima is taken.
     """
     from scipy.optimize import least_squares
-    from scipy.sparse import coo_array
+    from scipy.sparse import csr_array
 
     graph, chain = _Graph.of(edges), Sim3.stack(start)
     about = _local_frames(len(start), graph)
     back, forth = about.inverse(), chain @ about
     free = 6 if fixed_scale else 7
-    free_chunks = len(start) - 1
+    ends = torch.stack((graph.first, graph.second))
 
-    def placed(x: np.ndarray) -> Sim3:
+    def steps_of(x: np.ndarray) -> Tensor:
         steps = torch.zeros((len(start), 7), dtype=torch.float64)
-        steps[1:, :free] = torch.from_numpy(x).reshape(free_chunks, free)
-        return forth @ Sim3.exp(steps) @ back
+        steps[1:, :free] = torch.from_numpy(x).reshape(-1, free)
+        return steps
+
+    def errors_after(steps: Tensor, kernel: float) -> Tensor:
+        first, second = (forth[chunks] @ Sim3.exp(own) @ back[chunks] for chunks, own in zip(ends, steps, strict=True))
+        return graph.errors(first, second, kernel)
 
     def errors(x: np.ndarray, kernel: float) -> np.ndarray:
-        weighted = graph.weight.sqrt()[:, None] * graph.differences(placed(x))
-        square = weighted.square().sum(-1, keepdim=True).clamp(min=1e-300) / kernel**2
-        shrunk = (square.log1p() / square).sqrt() * weighted  # the square of its length is the Cauchy loss
-        return torch.where(graph.robust[:, None], shrunk, weighted).flatten().numpy()
+        return errors_after(steps_of(x)[ends], kernel).flatten().numpy()
 
-    ends = torch.stack((graph.first, graph.second), dim=1).numpy()
-    edge, end = np.nonzero(ends > 0)
-    rows = edge[:, None, None] * 7 + np.arange(7)[:, None] + np.zeros(free, int)
-    columns = (ends[edge, end] - 1)[:, None, None] * free + np.zeros((7, 1), int) + np.arange(free)
-    pattern = coo_array((np.ones(rows.size), (rows.ravel(), columns.ravel())), (len(edges) * 7, free_chunks * free))
+    def jacobian(x: np.ndarray, kernel: float) -> csr_array:
+        steps = steps_of(x)[ends].requires_grad_()
+        columns = errors_after(steps, kernel).sum(0)  # each edge has steps of its own, so the sum mixes nothing
+        slopes = torch.stack([torch.autograd.grad(one, steps, retain_graph=True)[0] for one in columns])
+        error, end, edge, step = (slopes != 0).nonzero(as_tuple=True)
+        chunk = ends[end, edge]
+        used = (chunk > 0) & (step < free)
+        entries = slopes[error, end, edge, step][used].numpy()
+        places = ((edge * 7 + error)[used].numpy(), ((chunk - 1) * free + step)[used].numpy())
+        return csr_array((entries, places), shape=(7 * len(edges), x.size))
 
     def minimum(x: np.ndarray, kernel: float) -> tuple[float, np.ndarray]:
+        # The inner solver must be exact: with its default tolerance a long chain takes hundreds of steps.
+        exact = {"regularize": False, "atol": 1e-12, "btol": 1e-12, "maxiter": 20 * x.size}
         found = least_squares(
-            errors, x, jac_sparsity=pattern.tocsr(), args=(kernel,), ftol=1e-12, xtol=1e-10, gtol=1e-12,
-            max_nfev=_MOST_EVALUATIONS, tr_options={"regularize": False, "atol": 1e-12, "btol": 1e-12, "maxiter": 20 * x.size},
+            errors, x, jac=jacobian, args=(kernel,), ftol=1e-9, xtol=1e-9, gtol=1e-12,
+            max_nfev=_MOST_STEPS, tr_options=exact,
         )  # fmt: skip
         return float(found.cost), found.x
 
-    cost, best = minimum(np.zeros(free_chunks * free), KERNEL)
+    chained = np.zeros((len(start) - 1) * free)
+    cost, best = minimum(chained, KERNEL)
     if bool(graph.robust.any()):
-        _, wide = minimum(np.zeros(free_chunks * free), _WIDE_KERNEL)
-        other_cost, other = minimum(wide, KERNEL)
+        other_cost, other = minimum(minimum(chained, _WIDE_KERNEL)[1], KERNEL)
         best = other if other_cost < cost else best
-    moved = placed(best)
+    moved = forth @ Sim3.exp(steps_of(best)) @ back
     return [start[0], *(moved[chunk] for chunk in range(1, len(start)))]
 
 
