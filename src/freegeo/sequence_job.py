@@ -361,7 +361,7 @@ class SequenceJob(Job):
             self._warn(f"{missing} of {len(self.batch)} photos are in no chunk that could be predicted.")
         summary: dict[str, Any] = {}
         for number, (members, frames) in reversed(list(enumerate(zip(pieces, _frames_of(pieces), strict=True)))):
-            summary = self._write_piece(number, members, frames, told if number == 0 else None, adaptation)
+            summary = self._write_piece(number, members, frames, told, adaptation)
         self.after(self)
         self.folder.finish()
         return summary

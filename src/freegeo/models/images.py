@@ -71,7 +71,8 @@ def look_at_photos(model: ReconstructionModel, photos: Sequence[PhotoLike], *, m
     geometry = {name: torch.cat([getattr(b, name) for b in looks]) for name in ("photo_hw", "scale_xy", "offset_xy")}
     frames = Frames(
         images=torch.zeros(()).expand(len(photos), *shape), names=tuple(photo.name for photo in photos), **geometry,
-        contents=contents.hexdigest(), photos=tuple(photos), chosen=tuple(range(len(photos))), blank=frozenset(blank), model=model, mixed=mixed,
+        contents=contents.hexdigest(), photos=tuple(photos), chosen=tuple(range(len(photos))),
+        blank=frozenset(blank), model=model, mixed=mixed,
     )  # fmt: skip
     _warn(frames, mixed)
     return frames
