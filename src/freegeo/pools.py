@@ -195,7 +195,9 @@ class RayPool:
 
     def ended(self) -> list[tuple[Any, Any]]:
         """Wait a moment, and return what has ended; FreeGeoError for an error of the work itself."""
-        done, _ = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=POLL_S)
+        # A signal that comes while ray itself waits would end this process with ray's exit code.
+        time.sleep(POLL_S)
+        done, _ = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=0)
         return [(self._running.pop(reference), self._outcome(reference)) for reference in done]
 
     def _outcome(self, reference: Any) -> Any:
