@@ -10,6 +10,7 @@ import contextlib
 import logging
 import os
 import signal
+import socket
 import subprocess
 import threading
 import time
@@ -32,6 +33,9 @@ POLL_S = 0.1
 """Seconds between two looks at what has ended."""
 GRACE_S = 20.0
 """Seconds that a process has to save its state when its pool is closed, before it is killed."""
+
+REACH_S = 10.0
+"""Seconds in which a ray cluster has to answer."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +199,9 @@ class RayPool:
 
     def ended(self) -> list[tuple[Any, Any]]:
         """Wait a moment, and return what has ended; FreeGeoError for an error of the work itself."""
-        done, _ = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=POLL_S)
+        # A signal that comes while ray itself waits would end this process with ray's exit code.
+        time.sleep(POLL_S)
+        done, _ = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=0)
         return [(self._running.pop(reference), self._outcome(reference)) for reference in done]
 
     def _outcome(self, reference: Any) -> Any:
@@ -248,15 +254,21 @@ def _connected() -> tuple[Any, bool]:
         raise UserError("--cluster needs ray: pip install 'freegeo[cluster]'.") from None
     if ray.is_initialized():
         return ray, False
-    before = signal.getsignal(signal.SIGTERM)
+    before, address = signal.getsignal(signal.SIGTERM), os.environ.get("RAY_ADDRESS", "")
     try:
+        _require_reachable(address)
         ray.init(log_to_driver=False, logging_level=logging.WARNING)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        address = os.environ.get("RAY_ADDRESS")
-        raise UserError(
-            f"ray does not start{f' with RAY_ADDRESS={address}' if address else ''} ({' '.join(str(error).split())})."
-        ) from None
+    except (OSError, RuntimeError, ValueError) as error:
+        where = f" with RAY_ADDRESS={address}" if address else ""
+        raise UserError(f"ray cannot be used{where}: {' '.join(str(error).split())}.") from None
     if threading.current_thread() is threading.main_thread():
         # It puts a handler of its own there, after which SIGTERM would not end this process as it should.
         signal.signal(signal.SIGTERM, before)
     return ray, True
+
+
+def _require_reachable(address: str) -> None:
+    """Raise OSError when nobody listens at `host:port`, for which ray itself would wait for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=REACH_S).close()

@@ -2,12 +2,14 @@
 
 import os
 import shutil
+import socket
 import subprocess
 import sys
 from dataclasses import fields, is_dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from freegeo.cli.options import ModelOptions, PhotoOptions, PlacingOptions, Reci
 from freegeo.cli.scenes import named_scenes
 from freegeo.errors import UserError
 from freegeo.files import read_json
+from freegeo.run_folder import run_folder
 from processes import kill_one, needs_proc
 
 FROZEN = ["--no-adapt", "--refine", "off"]
@@ -183,6 +186,25 @@ def test_mistakes_are_refused_before_the_first_scene(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("ray", "words"),
+    [
+        (None, "pip install 'freegeo[cluster]'"),
+        (SimpleNamespace(is_initialized=lambda: False), "RAY_ADDRESS=127.0.0.1:"),
+    ],
+)
+def test_a_cluster_that_is_not_there(freegeo, photo_folder, tiny, tmp_path, monkeypatch, ray, words):
+    with socket.socket() as taken:
+        # Nobody listens there.
+        taken.bind(("127.0.0.1", 0))
+        monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{taken.getsockname()[1]}")
+        monkeypatch.setitem(sys.modules, "ray", ray)
+        outcome = freegeo("batch", photo_folder, "-o", tmp_path / "out", *tiny, "--cluster")
+    assert outcome.code == 2
+    assert words in outcome.sentence()
+    assert not (tmp_path / "out").exists()
+
+
 def test_places_that_are_taken_are_refused(freegeo, photo_folder, tiny, tmp_path):
     out = tmp_path / "out"
     (out / photo_folder.name).mkdir(parents=True)
@@ -192,7 +214,8 @@ def test_places_that_are_taken_are_refused(freegeo, photo_folder, tiny, tmp_path
     outcome = freegeo("batch", photo_folder, "-o", out, *tiny)
     assert outcome.code == 2 and "did not write" in outcome.sentence()
     assert (out / "index.html").read_text() == ""
-    assert freegeo("run", photo_folder, "-o", tmp_path / "one", *tiny, *FROZEN).code == 0
+    with run_folder(tmp_path / "one", {"command": "run"}) as folder:
+        folder.finish()
     assert "another command" in freegeo("batch", photo_folder, "-o", tmp_path / "one", *tiny).sentence()
 
 
@@ -295,7 +318,22 @@ def test_a_retry_does_not_overwrite_what_it_continues(freegeo, here, rooms, tiny
 
 
 def test_a_saved_adapter_reconstructs_every_scene(freegeo, here, rooms, tiny, tmp_path):
-    assert freegeo("adapt", rooms / "room-0", "-o", tmp_path / "adapter", *tiny, *QUICK).code == 0
+    assert (
+        freegeo(
+            "adapt",
+            rooms / "room-0",
+            "-o",
+            tmp_path / "adapter",
+            *tiny,
+            "--steps",
+            "1",
+            "--sets",
+            "1",
+            "--guard",
+            "off",
+        ).code
+        == 0
+    )
     out = tmp_path / "out"
     outcome = freegeo(
         "batch", rooms / "room-1", "-o", out, "--adapter", tmp_path / "adapter", "--checkpoint", tiny[-1],

@@ -249,11 +249,11 @@ class _Table:
             console.note(f"{len(self.skipped)} of {len(self.works)} scenes are finished already")
         if not self.waiting:
             return
-        for work in self.waiting:
-            work.log.unlink(missing_ok=True)
-        self.write()
-        started = time.monotonic()
         with self._pool(device, jobs=jobs, cluster=cluster) as pool:
+            for work in self.waiting:
+                work.log.unlink(missing_ok=True)
+            self.write()
+            started = time.monotonic()
             for work, outcome in outcomes(pool, self.waiting, on_wait=self._say_begun):
                 self._say_begun()
                 self.ended += 1
