@@ -34,7 +34,7 @@ from freegeo.data.procedural.rooms import (
 from freegeo.data.scene import Scene
 from freegeo.errors import UserError
 
-TURN_DEG = 7.5
+TURN_DEG = 6.0
 """The camera turns by about this much from one frame to the next, times the domain's pace."""
 ROOM_M = 6.0
 """Side of the square rooms."""
@@ -164,9 +164,10 @@ def walk(seed: int, domain: str | Domain, frames: int = 300, *, aspect: Aspect =
     Args:
         seed: one that the domain owns (`Domain.seeds`).
         domain: gives surfaces, light, lens and the camera's response; its `pace` is a factor on the turns.
-        frames: how many photos; about 45 to a room, of which there are at least four.
+        frames: how many photos; about 60 to a room, of which there are at least four.
         aspect: of the photos, which have the size of other generated photos.
-        alike: two corner rooms on opposite sides of the ring have the same walls, floor and things, differently arranged.
+        alike: two corner rooms on opposite sides of the ring have the same walls, floor and things, which stand in
+            other places.
 
     Raises:
         UserError: a negative seed, an unknown domain, or fewer frames than four rooms need.
@@ -240,7 +241,7 @@ def _ring(count: int) -> tuple[list[_Cell], tuple[float, float]]:
 
 
 def _turned(side: int, along: float, inwards: float) -> tuple[float, float]:
-    """What lies so far along the way, and so far to its left, where the way goes in direction `side` (quarter turns)."""
+    """Place so far along the way, and so far to its left, where the way goes in direction `side` (quarter turns)."""
     x, y = along, inwards
     return ((x, y), (-y, x), (-x, -y), (y, -x))[side % 4]
 
