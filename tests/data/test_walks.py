@@ -64,8 +64,11 @@ def test_neighbours_overlap_and_agree_and_far_frames_share_nothing():
     near = [shared(around, i, (i + 1) % FRAMES) for i in [*range(0, FRAMES, 30), FRAMES - 1]]
     assert min(share for share, _ in near) > 0.5
     assert np.median([error for _, error in near]) < 0.005
-    far = [shared(around, i, (i + 90) % FRAMES)[0] for i in range(0, FRAMES, 30)]
-    assert np.median(far) < 0.02 and max(far) < 0.25
+    opposite = [shared(around, i, (i + FRAMES // 2) % FRAMES)[0] for i in range(0, FRAMES, 30)]
+    assert max(opposite) < 0.05
+    # Doorways show a little of the next room.
+    next_room = [shared(around, i, (i + 90) % FRAMES)[0] for i in range(0, FRAMES, 30)]
+    assert np.median(next_room) < 0.02
 
 
 def test_cameras_stand_in_free_space():
