@@ -46,8 +46,10 @@ def shared(of: Walk, first: int, second: int) -> tuple[float, float]:
     )
     column, row = torch.where(carried.in_view[..., None], (carried.pixel + 0.5).floor(), 0.0).long().unbind(-1)
     measured = target.depth_z[0, 0].double()[row, column]
-    off = (carried.depth_z / measured - 1).abs()
+    off = (carried.depth_z - measured).abs()
+    # The two faces of a wall between rooms are 10 cm apart, and are not one surface.
     agrees = carried.in_view & (off < 0.05)
+    off = off / measured
     return float(agrees.double().mean()), float(off[agrees].median()) if agrees.any() else float("nan")
 
 
@@ -64,11 +66,8 @@ def test_neighbours_overlap_and_agree_and_far_frames_share_nothing():
     near = [shared(around, i, (i + 1) % FRAMES) for i in [*range(0, FRAMES, 30), FRAMES - 1]]
     assert min(share for share, _ in near) > 0.5
     assert np.median([error for _, error in near]) < 0.005
-    opposite = [shared(around, i, (i + FRAMES // 2) % FRAMES)[0] for i in range(0, FRAMES, 30)]
-    assert max(opposite) < 0.05
-    # Doorways show a little of the next room.
-    next_room = [shared(around, i, (i + 90) % FRAMES)[0] for i in range(0, FRAMES, 30)]
-    assert np.median(next_room) < 0.02
+    for apart, most in ((25, 0.25), (90, 0.02), (FRAMES // 2, 0.02)):
+        assert max(shared(around, i, (i + apart) % FRAMES)[0] for i in range(0, FRAMES, 30)) < most
 
 
 def test_cameras_stand_in_free_space():
