@@ -58,7 +58,7 @@ def camera_poses(
     # Jitter and ellipses stay inside by construction; the clamp guarantees it.
     limit = half_extent_m[:, None, :2] - 0.75 * WALL_MARGIN_M
     position = torch.cat([torch.clamp(position[..., :2], -limit, limit), position[..., 2:]], dim=-1)
-    return _look(position, yaw, pitch, roll), is_arc
+    return look(position, yaw, pitch, roll), is_arc
 
 
 def _between(uniform: Tensor, low: float, high: float) -> Tensor:
@@ -121,7 +121,7 @@ def _heights(trajectory: Tensor, progress: Tensor) -> Tensor:
     return torch.lerp(_between(trajectory[:, 8:9], 1.0, 1.8), _between(trajectory[:, 9:10], 1.0, 1.8), progress)
 
 
-def _look(position: Tensor, yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
+def look(position: Tensor, yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
     """`T_cam_room` (..., 4, 4) of cameras at `position` (..., 3): x right, y down, z forward; yaw from x towards y."""
     cos_pitch = pitch.cos()
     forward = torch.stack([yaw.cos() * cos_pitch, yaw.sin() * cos_pitch, pitch.sin()], dim=-1)

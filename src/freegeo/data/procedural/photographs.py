@@ -22,7 +22,7 @@ def photograph_room(seed: int, domain: str | Domain, frames: int = 16, aspect: A
     """Photograph one room along its camera path; depth and cameras are exact at the photos' size."""
     domain = get_domain(domain)
     views = render(sample_rooms([seed], domain=domain, frames=frames), *PHOTO_HW[aspect], supersample=SUPERSAMPLE)
-    photos = tuple(MemoryPhoto(f"{i:02d}.png", _to_bytes(image)) for i, image in enumerate(views.images[0]))
+    photos = tuple(MemoryPhoto(f"{i:02d}.png", to_bytes(image)) for i, image in enumerate(views.images[0]))
     return Scene(
         name=f"{domain.name}-{seed}",
         photos=photos,
@@ -32,5 +32,6 @@ def photograph_room(seed: int, domain: str | Domain, frames: int = 16, aspect: A
     )
 
 
-def _to_bytes(image: Tensor) -> np.ndarray:
+def to_bytes(image: Tensor) -> np.ndarray:
+    """Pixels (H, W, 3) uint8 of an image (3, H, W) in [0, 1]."""
     return (image.permute(1, 2, 0) * 255).round().byte().numpy()

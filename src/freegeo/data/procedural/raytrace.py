@@ -1,6 +1,6 @@
 """Analytic ray tracing of generated rooms: images, exact z-depth and cameras.
 
-The loop runs over the ten primitives; rooms, views and pixels are one flat dimension. Ray directions have unit z in the
+The loop runs over the primitives; rooms, views and pixels are one flat dimension. Ray directions have unit z in the
 camera frame, so the ray parameter *is* the z-depth. Source: docs/embedded-model.md, "How the rooms are made".
 
 Pixels. Pixel u of a W pixels wide image covers [u, u + 1) of the image plane, whose middle W / 2 the optical axis
@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from freegeo.data.procedural.rooms import FIRST_CYLINDER, FIRST_SPHERE, PRIMITIVES, RoomBatch
+from freegeo.data.procedural.rooms import RoomBatch
 from freegeo.data.procedural.textures import TEXTURE_SIZE, TextureBank, texture_bank
 from freegeo.errors import UserError
 
@@ -146,17 +146,17 @@ def _trace(rays: _Rays, rooms: RoomBatch, scene: Tensor) -> tuple[Tensor, Tensor
     offset = rays.origin[:, None] - center  # (V, P, 3)
     depth = _leave_box(offset[:, 0], (dx, dy, dz), size[:, 0])
     primitive = torch.zeros_like(depth, dtype=torch.int64)
-    for k in range(1, PRIMITIVES):
+    for k in range(1, center.shape[1]):
         ox, oy, oz = (offset[:, k, axis, None] for axis in range(3))
         sx, sy, sz = (size[:, k, axis, None] for axis in range(3))
-        if k < FIRST_SPHERE:
+        if k < rooms.first_sphere:
             cosine, sine = yaw[:, k, :1], yaw[:, k, 1:]
             near_x, far_x = _slab(cosine * ox + sine * oy, (cosine * dx + sine * dy).reciprocal(), sx)
             near_y, far_y = _slab(cosine * oy - sine * ox, (cosine * dy - sine * dx).reciprocal(), sy)
             near_z, far_z = _slab(oz, inverse_z, sz)
             enter = torch.maximum(torch.maximum(near_x, near_y), near_z)
             leave = torch.minimum(torch.minimum(far_x, far_y), far_z)
-        elif k < FIRST_CYLINDER:
+        elif k < rooms.first_cylinder:
             along = dx * ox + dy * oy + dz * oz
             enter, leave = _quadric(length_square, along, ox * ox + oy * oy + oz * oz - sx * sx.abs())
         else:
@@ -192,25 +192,25 @@ def _quadric(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
 def _shade(
     rays: _Rays, depth: Tensor, primitive: Tensor, rooms: RoomBatch, scene: Tensor, bank: TextureBank, width: int
 ) -> Tensor:
-    """Linear colour (V, 3, N) of the hits: textured albedo under the lamp and ambient light."""
-    row = scene[:, None] * PRIMITIVES + primitive
+    """Linear colour (V, 3, N) of the hits: textured albedo under ambient light and lamps, which cast no shadows."""
+    row = scene[:, None] * rooms.center.shape[1] + primitive
     center, size, yaw = (getattr(rooms, name).flatten(0, 1).unbind(-1) for name in ("center", "size", "yaw"))
     point = [rays.origin[:, a, None] + depth * rays.direction[a] for a in range(3)]
     cosine, sine = yaw[0][row], yaw[1][row]
     local = _turned([point[a] - center[a][row] for a in range(3)], cosine, sine)
     scaled = [local[a] / size[a][row] for a in range(3)]
-    axis, normal = _surface(scaled, primitive)
-
-    lamp = _turned([rooms.lamp_position[scene][:, a, None] - point[a] for a in range(3)], cosine, sine)
-    distance_square = lamp[0] ** 2 + lamp[1] ** 2 + lamp[2] ** 2
-    facing = lamp[0] * normal[0] + lamp[1] * normal[1] + lamp[2] * normal[2]
-    strength = LAMP_GAIN * facing.clamp_min(0.0) * distance_square.clamp_min(1e-4).rsqrt()
-    strength = strength / (1.0 + distance_square / LAMP_REACH_M**2)
+    axis, normal = _surface(scaled, primitive, rooms)
 
     footprint = depth * (2.0 * torch.tan(0.5 * rooms.fov_rad[scene])[:, None] / width)
     albedo = _albedo(local, scaled, axis, primitive, footprint, rooms, scene, bank)
-    lamp_light = strength[:, None] * rooms.lamp_colour[scene][..., None]
-    light = rooms.ambient[scene][:, None, None] + lamp_light
+    light = rooms.ambient[scene][:, None, None]
+    for position, colour in zip(rooms.lamp_position.unbind(1), rooms.lamp_colour.unbind(1), strict=True):
+        lamp = _turned([position[scene][:, a, None] - point[a] for a in range(3)], cosine, sine)
+        distance_square = lamp[0] ** 2 + lamp[1] ** 2 + lamp[2] ** 2
+        facing = lamp[0] * normal[0] + lamp[1] * normal[1] + lamp[2] * normal[2]
+        strength = LAMP_GAIN * facing.clamp_min(0.0) * distance_square.clamp_min(1e-4).rsqrt()
+        strength = strength / (1.0 + distance_square / LAMP_REACH_M**2)
+        light = light + strength[:, None] * colour[scene][..., None]
     return (rooms.domain.exposure * albedo * light).clamp_(0.0, 1.0)
 
 
@@ -220,15 +220,15 @@ def _turned(vector: list[Tensor], cosine: Tensor, sine: Tensor) -> list[Tensor]:
     return [cosine * x + sine * y, cosine * y - sine * x, z]
 
 
-def _surface(scaled: list[Tensor], primitive: Tensor) -> tuple[Tensor, list[Tensor]]:
+def _surface(scaled: list[Tensor], primitive: Tensor, rooms: RoomBatch) -> tuple[Tensor, list[Tensor]]:
     """Axis (V, N) along which the surface is textured and the unit normal in the primitive's frame.
 
     `scaled` is the hit in units of the primitive's half sizes, so faces, caps and shells are where it reaches 1.
     """
     x, y, z = scaled
     abs_x, abs_y, abs_z = x.abs(), y.abs(), z.abs()
-    is_cylinder = primitive >= FIRST_CYLINDER
-    is_sphere = (primitive >= FIRST_SPHERE) & ~is_cylinder
+    is_cylinder = primitive >= rooms.first_cylinder
+    is_sphere = (primitive >= rooms.first_sphere) & ~is_cylinder
     is_z = abs_z > torch.where(is_cylinder, torch.hypot(x, y), torch.maximum(abs_x, abs_y))
     is_x = ~is_z & (abs_x > abs_y)
     axis = torch.where(is_z, 2, torch.where(is_x, 0, 1))

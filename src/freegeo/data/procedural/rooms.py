@@ -49,8 +49,8 @@ class RoomBatch:
     period_m: Tensor  # (B, M, 2)
     offset: Tensor  # (B, M, 2, 2) texture, then u and v, in periods
     colour: Tensor  # (B, M, 3, 3) three colours, RGB in [0, 1]
-    lamp_position: Tensor  # (B, 3)
-    lamp_colour: Tensor  # (B, 3)
+    lamp_position: Tensor  # (B, L, 3)
+    lamp_colour: Tensor  # (B, L, 3)
     ambient: Tensor  # (B,)
     gamma: Tensor  # (B,)
     cast: Tensor  # (B, 3) factor on each colour channel
@@ -58,6 +58,10 @@ class RoomBatch:
     is_arc: Tensor  # (B,) bool
     T_cam_room: Tensor  # (B, S, 4, 4)
     T_room_world: Tensor  # (B, 4, 4)
+    first_sphere: int
+    """Number of the first sphere among the primitives; those from 1 to there are boxes."""
+    first_cylinder: int
+    """Number of the first cylinder."""
 
     def __len__(self) -> int:
         return len(self.seeds)
@@ -112,12 +116,12 @@ def sample_rooms(
     if not seeds or min(seeds) < 0 or frames < 1:
         raise UserError("rooms need at least one seed, seeds of 0 or more, and at least one frame")
     half_extent, placed = _contents(seeds, domain)
-    trajectory = _uniform(seeds, 1, TRAJECTORY_NUMBERS + 5)
-    jitter = _uniform(seeds, 2, frames * FRAME_NUMBERS).view(len(seeds), frames, FRAME_NUMBERS)
+    trajectory = uniform(seeds, 1, TRAJECTORY_NUMBERS + 5)
+    jitter = uniform(seeds, 2, frames * FRAME_NUMBERS).view(len(seeds), frames, FRAME_NUMBERS)
     T_cam_room, is_arc = camera_poses(half_extent, trajectory[:, :TRAJECTORY_NUMBERS], jitter, pace=domain.pace)
     center, yaw, size = _placement(half_extent, placed, is_arc)
     camera = -(T_cam_room[..., :3, :3].mT @ T_cam_room[..., :3, 3:])[..., 0]
-    near = (_distance(camera, center, yaw, size) < CLEARANCE_M).any(dim=1)
+    near = (distance_m(camera, center, yaw, size, FIRST_SPHERE, FIRST_CYLINDER) < CLEARANCE_M).any(dim=1)
     near[:, 0] = False
     low, high = domain.field_of_view_deg
     batch = RoomBatch(
@@ -126,17 +130,19 @@ def sample_rooms(
         center=center,
         yaw=yaw,
         size=torch.where(near[..., None], -1.0, size),
-        **_materials(seeds, domain),
-        **_light(seeds, domain, half_extent),
+        **room_materials(seeds, domain),
+        **room_light(seeds, domain, half_extent),
         fov_rad=torch.deg2rad(low + (high - low) * trajectory[:, TRAJECTORY_NUMBERS]),
         is_arc=is_arc,
         T_cam_room=T_cam_room,
-        T_room_world=_world(trajectory[:, TRAJECTORY_NUMBERS + 1 :]),
+        T_room_world=upright_world(trajectory[:, TRAJECTORY_NUMBERS + 1 :]),
+        first_sphere=FIRST_SPHERE,
+        first_cylinder=FIRST_CYLINDER,
     )
     return batch.to(device)
 
 
-def _uniform(seeds: Sequence[int], stream: int, count: int) -> Tensor:
+def uniform(seeds: Sequence[int], stream: int, count: int) -> Tensor:
     """(B, count) uniform numbers: row b depends on `seeds[b]` and `stream` alone, and is a prefix of longer rows."""
     rows = np.stack([np.random.default_rng((seed, stream)).random(count) for seed in seeds])
     return torch.from_numpy(rows.astype(np.float32))
@@ -144,7 +150,7 @@ def _uniform(seeds: Sequence[int], stream: int, count: int) -> Tensor:
 
 def _contents(seeds: Sequence[int], domain: Domain) -> tuple[Tensor, Tensor]:
     """(B, 3) half width, half depth and full height; (B, P - 1, 8) uniform numbers of the primitives."""
-    numbers = _uniform(seeds, 0, 3 + (PRIMITIVES - 1) * _OBJECT_NUMBERS)
+    numbers = uniform(seeds, 0, 3 + (PRIMITIVES - 1) * _OBJECT_NUMBERS)
     low, high = domain.half_extent_m
     extent = low + (high - low) * numbers[:, :2]
     height = 2.5 + 0.8 * numbers[:, 2:3]
@@ -185,15 +191,25 @@ def _placement(half_extent: Tensor, numbers: Tensor, is_arc: Tensor) -> tuple[Te
 
 def _sizes(numbers: Tensor) -> Tensor:
     """(B, P - 1, 3) half sizes in metres from uniform numbers (B, P - 1, 8)."""
+    sizes = object_sizes(numbers)
+    kind = torch.arange(1, PRIMITIVES)[:, None]
+    return torch.where(
+        kind < FIRST_SPHERE, sizes["box"], torch.where(kind < FIRST_CYLINDER, sizes["sphere"], sizes["cylinder"])
+    )
+
+
+def object_sizes(numbers: Tensor) -> dict[str, Tensor]:
+    """Half sizes (..., 3) in metres of things from uniform numbers (..., 8), for each kind that they could be of."""
     box = torch.tensor([0.2, 0.2, 0.15]) + torch.tensor([0.5, 0.5, 0.75]) * numbers[..., 5:8]
     radius = 0.22 + 0.28 * numbers[..., 5:6]
-    sphere = radius.expand(*numbers.shape[:2], 3)
-    cylinder = torch.cat([0.14 + 0.26 * numbers[..., 5:6].expand(*numbers.shape[:2], 2), box[..., 2:]], dim=-1)
-    kind = torch.arange(1, PRIMITIVES)[:, None]
-    return torch.where(kind < FIRST_SPHERE, box, torch.where(kind < FIRST_CYLINDER, sphere, cylinder))
+    sphere = radius.expand(*numbers.shape[:-1], 3)
+    cylinder = torch.cat([0.14 + 0.26 * numbers[..., 5:6].expand(*numbers.shape[:-1], 2), box[..., 2:]], dim=-1)
+    return {"box": box, "sphere": sphere, "cylinder": cylinder}
 
 
-def _distance(point: Tensor, center: Tensor, yaw: Tensor, size: Tensor) -> Tensor:
+def distance_m(
+    point: Tensor, center: Tensor, yaw: Tensor, size: Tensor, first_sphere: int, first_cylinder: int
+) -> Tensor:
     """Distance in metres of points (B, S, 3) from primitives (B, P, ...): (B, S, P), at most 0 inside."""
     offset = point[:, :, None] - center[:, None]
     cosine, sine = yaw[:, None, :, 0], yaw[:, None, :, 1]
@@ -203,16 +219,16 @@ def _distance(point: Tensor, center: Tensor, yaw: Tensor, size: Tensor) -> Tenso
     sphere = local.norm(dim=-1) - size[:, None, :, 0]
     radial = (torch.hypot(x, y) - size[:, None, :, 0]).clamp_min(0.0)
     cylinder = torch.hypot(radial, (offset[..., 2].abs() - size[:, None, :, 2]).clamp_min(0.0))
-    kind = torch.arange(PRIMITIVES)
-    return torch.where(kind < FIRST_SPHERE, box, torch.where(kind < FIRST_CYLINDER, sphere, cylinder))
+    kind = torch.arange(center.shape[1])
+    return torch.where(kind < first_sphere, box, torch.where(kind < first_cylinder, sphere, cylinder))
 
 
-def _materials(seeds: Sequence[int], domain: Domain) -> dict[str, Tensor]:
-    """Textures, periods, offsets and colours of the surfaces."""
-    numbers = _uniform(seeds, 3, MATERIALS * _MATERIAL_NUMBERS + 1)
+def room_materials(seeds: Sequence[int], domain: Domain, count: int = MATERIALS) -> dict[str, Tensor]:
+    """Textures, periods, offsets and colours of `count` surfaces."""
+    numbers = uniform(seeds, 3, count * _MATERIAL_NUMBERS + 1)
     low, high = domain.contrast
     contrast = (low + (high - low) * numbers[:, -1])[:, None, None, None]
-    numbers = numbers[:, :-1].view(-1, MATERIALS, _MATERIAL_NUMBERS)
+    numbers = numbers[:, :-1].view(-1, count, _MATERIAL_NUMBERS)
     colour = 0.12 + 0.85 * numbers[..., 8:17].unflatten(-1, (3, 3))
     grey = colour.mean(dim=-1, keepdim=True)
     colour = grey + domain.saturation * (colour - grey)
@@ -225,21 +241,21 @@ def _materials(seeds: Sequence[int], domain: Domain) -> dict[str, Tensor]:
     }
 
 
-def _light(seeds: Sequence[int], domain: Domain, half_extent: Tensor) -> dict[str, Tensor]:
+def room_light(seeds: Sequence[int], domain: Domain, half_extent: Tensor) -> dict[str, Tensor]:
     """Lamp, ambient share, and the gamma and colour cast of the camera."""
-    numbers = _uniform(seeds, 4, _LIGHT_NUMBERS)
+    numbers = uniform(seeds, 4, _LIGHT_NUMBERS)
     lamp_ground = (2.0 * numbers[:, :2] - 1.0) * 0.6 * half_extent[:, :2]
     lamp_height = half_extent[:, 2:] * (0.72 + 0.2 * numbers[:, 2:3])
     return {
-        "lamp_position": torch.cat([lamp_ground, lamp_height], dim=1),
-        "lamp_colour": 0.9 + 0.2 * numbers[:, 3:6],
+        "lamp_position": torch.cat([lamp_ground, lamp_height], dim=1)[:, None],
+        "lamp_colour": 0.9 + 0.2 * numbers[:, None, 3:6],
         "ambient": domain.ambient[0] + (domain.ambient[1] - domain.ambient[0]) * numbers[:, 6],
         "gamma": domain.gamma[0] + (domain.gamma[1] - domain.gamma[0]) * numbers[:, 7],
         "cast": 1.0 - domain.colour_cast * numbers[:, 8:11],
     }
 
 
-def _world(numbers: Tensor) -> Tensor:
+def upright_world(numbers: Tensor) -> Tensor:
     """`T_room_world` (B, 4, 4): a turn about the vertical and an offset of up to 5 m, from uniform numbers (B, 4)."""
     angle = 2.0 * math.pi * numbers[:, 0]
     pose = torch.eye(4).repeat(len(numbers), 1, 1)
