@@ -58,7 +58,7 @@ def main() -> None:
             previous = first
             rows["black"].append(align(*chunks(model, darkened(scene.photos)), SHARED))
     results = {name: summary(seams) for name, seams in rows.items()}
-    trusted = np.array([seam.reason is None for seam in rows["true"]])
+    trusted = np.array([seam.reason is None and seam.doubt is None for seam in rows["true"]])
     results["errors of trusted seams"] = error_summary(np.array(errors)[trusted])
     results["errors of named seams"] = error_summary(np.array(errors)[~trusted])
     settings = {"rooms": arguments.rooms, "first": arguments.first, "domains": arguments.domains}
@@ -105,7 +105,8 @@ def summary(seams: list[Seam]) -> dict[str, object]:
     shares = [seam.inliers for seam in seams]
     low, lower, median, upper, high = np.percentile(shares, [0, 10, 50, 90, 100]).round(3).tolist()
     return {
-        "seams": len(seams), "trusted": sum(seam.reason is None for seam in seams),
+        "seams": len(seams), "trusted": sum(seam.reason is None and seam.doubt is None for seam in seams),
+        "used": sum(seam.reason is None for seam in seams),
         "inliers": {"least": low, "10 %": lower, "median": median, "90 %": upper, "most": high},
     }  # fmt: skip
 

@@ -353,9 +353,16 @@ class SequenceJob(Job):
         if len(parts) > 1:
             others = ", ".join(f"frames {part['first']} to {part['last']} in {part['folder']}" for part in parts[1:])
             self._warn(
-                f"The photos fall into {len(parts)} pieces whose places to each other are not known, since chunks do "
-                f"not fit together: the result is that of frames {parts[0]['first']} to {parts[0]['last']}, and there "
-                f"are {others}. Photos of what lies between would join them."
+                f"The photos fall into {len(parts)} pieces that could not be joined: the result is that of frames "
+                f"{parts[0]['first']} to {parts[0]['last']}, and there are {others}."
+            )
+        doubtful = [seam for seam in told["seams"] if seam["used"] and seam["reason"] and seam["kind"] != "loop"]
+        if doubtful:
+            worst = min(doubtful, key=lambda seam: seam["inliers"])
+            self._warn(
+                f"{len(doubtful)} of {len(told['seams'])} seams between chunks are doubtful, most of all that of chunks "
+                f"{worst['first']} and {worst['second']} ({worst['inliers']:.0%} of the shared pixels agree): surfaces "
+                "may be bent or doubled there. Try another --chunk, a larger --overlap or a larger model."
             )
         if missing:
             self._warn(f"{missing} of {len(self.batch)} photos are in no chunk that could be predicted.")

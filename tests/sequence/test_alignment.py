@@ -11,7 +11,7 @@ from exact_rooms import room
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.geometry.camera import project
 from freegeo.geometry.sim3 import Sim3, umeyama
-from freegeo.sequence.alignment import FEWEST_INLIERS, FEWEST_PIXELS, align, gap
+from freegeo.sequence.alignment import DOUBTFUL_INLIERS, FEWEST_INLIERS, FEWEST_PIXELS, align, gap
 
 ROWS = [(2, 0), (3, 1)]
 MOVE = Sim3.exp(torch.tensor([0.4, -1.1, 0.3, 2.0, -1.0, 0.5, 0.9], dtype=torch.float64))
@@ -215,8 +215,8 @@ def test_what_cannot_be_trusted_is_named():
         return said
 
     other_room = room(views=4, seed=8)
-    assert "disagree" in reason(other=other_room)
-    assert "disagree" in reason(rows=[(2, 2), (3, 3)])
+    assert "do not fit together" in reason(other=other_room)
+    assert align(first, second, [(2, 2), (3, 3)]).doubt is not None
     assert "one colour" in reason(one=replace(first, images=np.full_like(first.images, 7)))
     assert "cut or scaled" in reason(other=replace(second, offset_xy=second.offset_xy + 3))
     huge = Sim3(s=torch.tensor(50.0, dtype=torch.float64), R=MOVE.R, t=MOVE.t)
@@ -228,6 +228,18 @@ def test_what_cannot_be_trusted_is_named():
     assert (none.pixels, none.inliers) == (0, 0.0)
     assert none.reason is not None
     assert gap(replace(first, depth_z=np.full_like(first.depth_z, np.nan)), second, ROWS, MOVE, MOVE) is None
+
+
+def test_a_seam_that_fits_badly_is_used_and_doubted():
+    first, second = chunk([0, 1, 2, 3]), chunk([2, 3, 4, 5], MOVE)
+    wrong = np.random.default_rng(0).random(second.depth_z.shape) < 0.5
+    bad = replace(second, depth_z=np.where(wrong, 2 * second.depth_z, second.depth_z))
+    seam = align(first, bad, ROWS)
+    assert FEWEST_INLIERS < seam.inliers < DOUBTFUL_INLIERS
+    assert seam.reason is None
+    assert seam.doubt is not None
+    assert f"{seam.inliers:.0%}" in seam.doubt
+    assert align(first, second, ROWS).doubt is None
 
 
 def test_a_narrow_strip_does_not_fix_a_turn():
@@ -264,4 +276,3 @@ def test_points_are_those_of_the_pixels():
     T = torch.from_numpy(one.T_cam_world[1])
     pixels = project(points @ T[:3, :3].mT + T[:3, 3], torch.from_numpy(one.K[1]).double())
     assert float((pixels[70] - torch.tensor([6.0, 1.0])).abs().max()) < 1e-6
-    assert FEWEST_INLIERS > 0.5

@@ -226,6 +226,7 @@ def test_a_seam_becomes_an_edge():
         centre=tensor(1, 2, 3),
         depth=4.0,
         reason=None,
+        doubt=None,
     )
     made = Edge.of(3, 4, seam, robust=True)
     assert (made.first, made.second, made.weight, made.size, made.robust) == (3, 4, 0.8, 4.0, True)

@@ -219,6 +219,8 @@ def embedded_spec(config: DA3Config) -> ModelSpec:
         adaptation=AdaptationDefaults(temperature=2.5, scene_lr=1e-3, rank=16, neighbours=True),
         ray_cameras=True,
         takes="cameras",
+        # It was trained on up to 16 views; what it makes of more consecutive ones: docs/sequences.md, "Measured".
+        chunk=16,
     )
 
 

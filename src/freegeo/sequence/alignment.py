@@ -24,8 +24,9 @@ __all__ = ["FEWEST_INLIERS", "INLIER", "Depths", "Seam", "align", "gap"]
 
 INLIER = 0.1
 """Two points of one pixel agree when they are closer than this share of the pixel's depth."""
-FEWEST_INLIERS = 0.6
-"""A seam is trusted when so many of the shared pixels agree."""
+FEWEST_INLIERS, DOUBTFUL_INLIERS = 0.3, 0.6
+"""Shares of the shared pixels that have to agree: with fewer than the first a seam is as bad as one to another scene,
+and is not used; with fewer than the second it is used and doubted."""
 FEWEST_PIXELS = 100
 LARGEST_SCALE = 20.0
 """A chunk that is larger or smaller than its neighbour by more than this factor is not believed."""
@@ -102,7 +103,9 @@ class Seam:
     depth: float
     """Median depth of the shared pixels in the second chunk's units."""
     reason: str | None
-    """A sentence, without a capital, that says why the seam cannot be trusted; None: it can."""
+    """A sentence that says why the seam cannot be used; None: it can."""
+    doubt: str | None
+    """A sentence that says why a seam that can be used is not sure; None: it is."""
 
     @property
     def weight(self) -> float:
@@ -179,7 +182,8 @@ def align(first: Depths, second: Depths, rows: Sequence[tuple[int, int]], *, fix
         rms=rms,
         centre=shared.second.mean(0),
         depth=depth,
-        reason=_doubt(sim3, inliers, rms, _narrowness(shared.second[inlying] / depth)),
+        reason=_refusal(sim3, inliers, rms, _narrowness(shared.second[inlying] / depth)),
+        doubt=_doubt(inliers),
     )
 
 
@@ -212,6 +216,7 @@ def _nothing(frames: int, pixels: int, reason: str) -> Seam:
         centre=torch.zeros(3, dtype=torch.float64),
         depth=1.0,
         reason=reason,
+        doubt=None,
     )
 
 
@@ -316,15 +321,21 @@ def _narrowness(points: Tensor) -> float:
     return float(torch.linalg.eigvalsh(points.T.cov())[1].clamp(min=0).sqrt())
 
 
-def _doubt(sim3: Sim3, inliers: float, rms: float, extent: float) -> str | None:
+def _refusal(sim3: Sim3, inliers: float, rms: float, extent: float) -> str | None:
     scale = float(sim3.s)
     if not (1 / LARGEST_SCALE < scale < LARGEST_SCALE):
         return f"one chunk would be {max(scale, 1 / scale):.3g} times as large as the other."
     if inliers < FEWEST_INLIERS:
         return (
-            f"the two chunks disagree: {inliers:.0%} of the shared pixels have one place, "
+            f"the two chunks do not fit together: {inliers:.0%} of the shared pixels have one place, and "
             f"{FEWEST_INLIERS:.0%} are needed."
         )
     if rms > LARGEST_LEVERAGE * extent:
         return "the shared pixels show too narrow a part of the scene to fix how one chunk is turned to the other."
     return None
+
+
+def _doubt(inliers: float) -> str | None:
+    if inliers >= DOUBTFUL_INLIERS:
+        return None
+    return f"the two chunks fit badly: only {inliers:.0%} of the shared pixels have one place."

@@ -15,8 +15,6 @@ from freegeo.sequence.graph import Edge, place
 
 Kind = Literal["neighbours", "bridge", "loop"]
 """What a seam joins: chunks that follow each other, others that share frames, or a loop to the sequence."""
-LEAST_TRUST = 0.5
-"""Weight of a loop's seam, after all seams were brought together, below which it counts as contradicted."""
 _OPEN = 4
 """Chunks that are held in memory."""
 
@@ -40,7 +38,7 @@ class Joint:
         return {
             "first": self.first, "second": self.second, "frames": seam.frames, "kind": self.kind,
             "inliers": seam.inliers, "rms": seam.rms, "scale": float(seam.sim3.s), "gap": self.gap,
-            "used": self.reason is None, "reason": self.reason,
+            "used": self.reason is None, "reason": self.reason or seam.doubt,
         }  # fmt: skip
 
 
@@ -84,14 +82,17 @@ def assemble(
             pieces=[[number for number, chunk in enumerate(chunks) if not chunk.loop]],
         )  # fmt: skip
     good = [pair for pair in pairs if seams[pair].reason is None]
-    edges = [Edge.of(a, b, seams[a, b], robust=_kind(chunks, a, b) == "loop") for a, b in good]
+    edges = [
+        Edge.of(a, b, seams[a, b], robust=seams[a, b].doubt is not None or _kind(chunks, a, b) == "loop")
+        for a, b in good
+    ]
     found = place(len(chunks), edges, fixed_scale=fixed_scale)
     trust = dict(zip(good, found.trust, strict=True))
     of = {number: k for k, piece in enumerate(found.pieces) for number in piece}
     joints = []
     for a, b in pairs:
         reason = seams[a, b].reason
-        if reason is None and trust[a, b] < LEAST_TRUST:
+        if reason is None and trust[a, b] == 0:
             reason = "it contradicts the other seams."
         together = of[a] == of[b]
         apart = None
