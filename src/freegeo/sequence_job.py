@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -51,8 +51,8 @@ from freegeo.pipeline import capital, judge_by_photos, scene_images
 from freegeo.posed import doubt_focal_length, with_one_camera
 from freegeo.report.page import write_report
 from freegeo.run_folder import Part
-from freegeo.sequence.assembly import Assembly, assemble
-from freegeo.sequence.chunks import Chunk, plan_chunks
+from freegeo.sequence.assembly import Assembly, Seams, assemble, broken, seams_between
+from freegeo.sequence.chunks import Chunk, bridge, plan_chunks
 from freegeo.sequence.cuts import find_cuts
 from freegeo.sequence.join import Joined, Member
 from freegeo.sequence.loops import Loop, agrees, loop_candidates, loop_frames, verified
@@ -79,6 +79,7 @@ SEQUENCE_PARTS = (
 LOOP_APART, FEWEST_APART = 2, 6
 """Frames of a loop are at least so many chunks, and so many frames, apart."""
 _READ_AT_ONCE = 16
+_NOT_NEEDED = "it fits to no other chunk, and these have all of its frames."
 _KNOWN_MEDIANS = ("scale", "spread", "rotation_deg", "position", "focal")
 """What is said of known cameras as the median over chunks."""
 
@@ -107,11 +108,14 @@ class SequenceJob(Job):
     uses_adapter: bool = False
     """Whether the result is that of the adapter, trained or given."""
     order: Literal["given", "similar"] = "given"
+    count: int = 0
+    """Chunks of the sequence."""
 
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
         self._put_in_order()
         chunks = self._chunks()
+        self.count = len(chunks)
         adaptation = self._adapted(chunks)
         self.uses_adapter = self.adapter is not None or adaptation.used
         for number in range(len(chunks)):
@@ -121,10 +125,20 @@ class SequenceJob(Job):
         loops, tied = self._loops() if self.plan.loops else ([], [])
         numbers = [number for number in range(len(chunks)) if number not in self.failed]
         parts = [*(chunks[number] for number in numbers), *tied]
-        names = [*(_chunk_name(number) for number in numbers), *map(_loop_name, tied)]
-        load = [partial(Reconstruction.load, self.folder / CHUNKS_FOLDER / name) for name in names]
+        load = [self._reader(_chunk_name(number)) for number in numbers] + [
+            self._reader(_tie_name(tie)) for tie in tied
+        ]
         with self._timed("seams between chunks", JOINING):
-            found = assemble(parts, lambda number: load[number](), fixed_scale=self.spec.metric, placed=self._is_placed)
+            seams = seams_between(parts, lambda number: load[number](), fixed_scale=self.spec.metric)
+        if not self._is_placed:
+            for tie in self._bridges(parts, seams):
+                parts.append(tie)
+                load.append(self._reader(_tie_name(tie)))
+        with self._timed("places of chunks", JOINING):
+            seams = seams_between(parts, lambda number: load[number](), fixed_scale=self.spec.metric, known=seams)
+            found = assemble(
+                parts, seams, lambda number: load[number](), fixed_scale=self.spec.metric, placed=self._is_placed
+            )
         pieces = [[Member(chunk=parts[k], sim3=found.sim3[k], load=load[k]) for k in piece] for piece in found.pieces]
         told = self._told_of(chunks, numbers, found, loops, pieces)
         return self._write(pieces, told, adaptation)
@@ -244,11 +258,11 @@ class SequenceJob(Job):
         """Return the job of a chunk; a loop has no number."""
         assert self.photos is not None
         frames = list(chunk.frames)
-        name = _loop_name(chunk) if number is None else _chunk_name(number)
+        name = _tie_name(chunk) if number is None else _chunk_name(number)
         label = (
             f"chunk {number} (frames {chunk}), {number + 1} of {count}"
             if number is not None
-            else f"loop of frames {chunk}"
+            else f"{chunk.tie} of frames {chunk}"
         )
         values = {f.name: getattr(self, f.name) for f in fields(Job)}
         values |= {
@@ -258,7 +272,7 @@ class SequenceJob(Job):
             "priors": None if self.priors is None else self.priors.select(frames), "masks": None, "scale": None,
             "hooks": Hooks(stage=lambda stage: self.hooks.stage(f"{label}: {stage}")),
         }  # fmt: skip
-        return ChunkJob(**values, whole=self, loop=chunk.loop)
+        return ChunkJob(**values, whole=self, is_tie=chunk.tie is not None)
 
     def _attempt(self, chunks: Sequence[Chunk], number: int, work: Callable[[ChunkJob], object]) -> None:
         """Do something with a chunk; go on without it, and say so, when there is no usable prediction of it."""
@@ -282,7 +296,7 @@ class SequenceJob(Job):
         for number, loop in enumerate(loops):
             if loop.reason is None:
                 frames = loop_frames(loop.first, loop.second, len(self.batch), self.plan.size)
-                chunk = Chunk(frames=frames, loop=True)
+                chunk = Chunk(frames=frames, tie="loop")
                 reason = self._refuted(chunk, loop)
                 if reason is None:
                     tied.append(chunk)
@@ -302,6 +316,22 @@ class SequenceJob(Job):
         matches = find_matches([self.photos[frame] for frame in loop.frames])
         return agrees(Candidate.of(found, str(self.compute.device)), chunk.frames, loop, matches).reason
 
+    def _bridges(self, parts: Sequence[Chunk], seams: Seams) -> Iterator[Chunk]:
+        """Predict the frames around each seam that does not hold together, which may tie its chunks."""
+        for a, b in broken(parts, seams):
+            tie = bridge(parts[a], parts[b], self.plan.size)
+            try:
+                self._job(tie).make()
+            except (UserError, LostFolderError):
+                raise
+            except FreeGeoError as error:
+                logger.info("no bridge over frames %s: %s", tie, error)
+            else:
+                yield tie
+
+    def _reader(self, name: str) -> Callable[[], Reconstruction]:
+        return partial(Reconstruction.load, self.folder / CHUNKS_FOLDER / name)
+
     @property
     def _is_placed(self) -> bool:
         """Whether all chunks are in the frame of known cameras."""
@@ -315,9 +345,8 @@ class SequenceJob(Job):
     ) -> dict[str, Any]:  # fmt: skip
         """Return what reconstruction.json says of the sequence."""
         piece_of = {numbers[k]: number for number, piece in enumerate(found.pieces) for k in piece}
-        # Chunks that are left out have no seams, and those of loops are numbered after all others.
-        ties = sum(1 for loop in loops if loop.reason is None)
-        number_of = [*numbers, *range(len(chunks), len(chunks) + ties)]
+        # Chunks that are left out have no seams, and those that tie others are numbered after all others.
+        number_of = [*numbers, *range(len(chunks), len(chunks) + len(found.sim3) - len(numbers))]
         refined = self.folder.notes.get("refinement") or {}
         frames = _frames_of(pieces)
         return {
@@ -325,7 +354,8 @@ class SequenceJob(Job):
             "chunks": [
                 {
                     "number": number, "first": chunk.frames[0], "last": chunk.frames[-1], "frames": len(chunk.frames),
-                    "piece": piece_of.get(number), "reason": self.failed.get(number),
+                    "piece": piece_of.get(number),
+                    "reason": self.failed.get(number, None if number in piece_of else _NOT_NEEDED),
                     "refined": refined.get(f"{CHUNKS_FOLDER}/{_chunk_name(number)}", {}).get("accepted"),
                 }
                 for number, chunk in enumerate(chunks)
@@ -356,13 +386,13 @@ class SequenceJob(Job):
                 f"The photos fall into {len(parts)} pieces that could not be joined: the result is that of frames "
                 f"{parts[0]['first']} to {parts[0]['last']}, and there are {others}."
             )
-        doubtful = [seam for seam in told["seams"] if seam["used"] and seam["reason"] and seam["kind"] != "loop"]
+        doubtful = [seam for seam in told["seams"] if seam["used"] and seam["reason"] and seam["kind"] == "neighbours"]
         if doubtful:
             worst = min(doubtful, key=lambda seam: seam["inliers"])
             self._warn(
-                f"{len(doubtful)} of {len(told['seams'])} seams between chunks are doubtful, most of all that of chunks "
-                f"{worst['first']} and {worst['second']} ({worst['inliers']:.0%} of the shared pixels agree): surfaces "
-                "may be bent or doubled there. Try another --chunk, a larger --overlap or a larger model."
+                f"Neighbouring chunks fit badly at {len(doubtful)} seams, worst of all chunks {worst['first']} and "
+                f"{worst['second']} ({worst['inliers']:.0%} of the shared pixels agree): surfaces may be bent or "
+                "doubled there. Try another --chunk, a larger --overlap or a larger model."
             )
         if missing:
             self._warn(f"{missing} of {len(self.batch)} photos are in no chunk that could be predicted.")
@@ -446,7 +476,8 @@ class SequenceJob(Job):
     def _refinement(self) -> dict[str, Any] | None:
         """Return what refinement made of the chunks; scores are medians over those where it was accepted."""
         noted = self.folder.notes.get("refinement") or {}
-        told = [value for name, value in noted.items() if name.startswith(CHUNKS_FOLDER) and "accepted" in value]
+        own = {f"{CHUNKS_FOLDER}/{_chunk_name(number)}" for number in range(self.count)}
+        told = [value for name, value in noted.items() if name in own and "accepted" in value]
         if not told:
             return None
         accepted = [one for one in told if one["accepted"]]
@@ -475,8 +506,8 @@ def _chunk_name(number: int) -> str:
     return f"{number:04d}"
 
 
-def _loop_name(chunk: Chunk) -> str:
-    return f"loop-{chunk.frames[0]:06d}-{chunk.frames[-1]:06d}"
+def _tie_name(chunk: Chunk) -> str:
+    return f"{chunk.tie}-{chunk.frames[0]:06d}-{chunk.frames[-1]:06d}"
 
 
 def _piece_folder(number: int) -> str:
@@ -534,7 +565,7 @@ class ChunkJob(Job):
     """A chunk of a sequence; the model and its adapter are those of the whole."""
 
     whole: SequenceJob
-    loop: bool = False
+    is_tie: bool = False
 
     @cached_property
     def model(self) -> ReconstructionModel:
@@ -548,7 +579,7 @@ class ChunkJob(Job):
 
     def make(self) -> Computed:
         """Write the result of the chunk; an adapter that was trained is judged already."""
-        frozen = self.frozen() if self.recipe is not None and not self.loop else None
+        frozen = self.frozen() if self.recipe is not None and not self.is_tie else None
         if frozen is not None and not self.whole.uses_adapter:
             final = frozen
         elif frozen is not None:

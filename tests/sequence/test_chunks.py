@@ -32,10 +32,10 @@ def test_sizes_that_cut_nothing_are_refused(size, overlap):
 
 
 def test_common_rows_name_the_same_frame():
-    one, two = Chunk(frames=(2, 3, 4, 5)), Chunk(frames=(4, 5, 20, 21), loop=True)
+    one, two = Chunk(frames=(2, 3, 4, 5)), Chunk(frames=(4, 5, 20, 21), tie="loop")
     assert common_rows(one, two) == [(2, 0), (3, 1)]
     assert common_rows(two, one) == [(0, 2), (1, 3)]
 
 
 def test_a_chunk_reads_as_its_frames():
-    assert str(Chunk(frames=(4, 5, 6, 20, 21), loop=True)) == "4-6 and 20-21"
+    assert str(Chunk(frames=(4, 5, 6, 20, 21), tie="loop")) == "4-6 and 20-21"

@@ -194,16 +194,16 @@ def _sentences(sequence: Mapping[str, Any]) -> list[str]:
 
 
 def _seam_sentence(sequence: Mapping[str, Any]) -> str:
-    seams = [seam for seam in sequence["seams"] if seam["kind"] != "loop"]
+    seams = [seam for seam in sequence["seams"] if seam["kind"] == "neighbours"]
     unused = [seam for seam in seams if not seam["used"]]
     if not seams:
-        return "There is no seam."
+        return "There is no seam between neighbours."
     if not unused:
-        return f"{len(seams)} seams, all used." if len(seams) > 1 else "1 seam, used."
+        return f"{len(seams)} seams between neighbours, all used." if len(seams) > 1 else "1 seam, used."
     piece_of = {chunk["number"]: chunk["piece"] for chunk in sequence["chunks"]}
     bridged = sum(piece_of[seam["first"]] == piece_of[seam["second"]] for seam in unused)
     more = f"; {bridged} of them {'is' if bridged == 1 else 'are'} bridged by others" if bridged else ""
-    return f"{len(unused)} of {_count(len(seams), 'seam')} could not be used{more}."
+    return f"{len(unused)} of {_count(len(seams), 'seam')} between neighbours could not be used{more}."
 
 
 def _problems(sequence: Mapping[str, Any]) -> list[str]:

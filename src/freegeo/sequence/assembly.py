@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
@@ -15,6 +15,9 @@ from freegeo.sequence.graph import Edge, place
 
 Kind = Literal["neighbours", "bridge", "loop"]
 """What a seam joins: chunks that follow each other, others that share frames, or a loop to the sequence."""
+Load = Callable[[int], Depths]
+Seams = Mapping[tuple[int, int], Seam]
+"""By the numbers of two chunks, the smaller first."""
 _OPEN = 4
 """Chunks that are held in memory."""
 
@@ -50,38 +53,59 @@ class Assembly:
     sim3: list[Sim3]
     """Of each chunk: from its own frame to that of its piece."""
     pieces: list[list[int]]
-    """Chunks by their numbers, without those of loops; the piece with most frames first."""
+    """Chunks by their numbers, without those of loops; the piece with most frames first. A frame of several pieces
+    belongs to the first of them, and a piece without a frame of its own is none."""
+
+
+def seams_between(
+    chunks: Sequence[Chunk], load: Load, *, fixed_scale: bool = False, known: Seams | None = None
+) -> dict[tuple[int, int], Seam]:
+    """Align every two chunks that share frames.
+
+    Args:
+        chunks: those of the sequence in its order, and those that tie it together.
+        load: reads the prediction of a chunk by its number here.
+        fixed_scale: lengths of all chunks have one unit, such as metres: seams turn and move only.
+        known: seams that were measured before.
+    """
+    read, found = lru_cache(maxsize=_OPEN)(load), dict(known or {})
+    for pair in combinations(range(len(chunks)), 2):
+        rows = common_rows(*(chunks[number] for number in pair))
+        if rows and pair not in found:
+            found[pair] = align(read(pair[0]), read(pair[1]), rows, fixed_scale=fixed_scale)
+    return found
+
+
+def broken(chunks: Sequence[Chunk], seams: Seams) -> list[tuple[int, int]]:
+    """Return the seams between neighbours of the sequence that do not hold."""
+    return [(a, b) for (a, b), seam in seams.items() if seam.reason is not None and _kind(chunks, a, b) == "neighbours"]
 
 
 def assemble(
-    chunks: Sequence[Chunk], load: Callable[[int], Depths], *, fixed_scale: bool = False, placed: bool = False
+    chunks: Sequence[Chunk], seams: Seams, load: Load, *, fixed_scale: bool = False, placed: bool = False
 ) -> Assembly:
-    """Align chunks where they share frames, and place them.
+    """Place chunks so that they fit at their seams.
 
     Args:
-        chunks: those of the sequence in its order, and those of loops.
+        chunks: as for `seams_between`.
+        seams: its result.
         load: reads the prediction of a chunk by its number here.
-        fixed_scale: lengths of all chunks have one unit, such as metres: seams turn and move only.
-        placed: the chunks are in one frame already, as with known cameras: seams are measured, and nothing is moved.
+        fixed_scale: as for `seams_between`.
+        placed: the chunks are in one frame already, as with known cameras: nothing is moved.
     """
     read = lru_cache(maxsize=_OPEN)(load)
-    pairs = [(a, b) for a, b in combinations(range(len(chunks)), 2) if common_rows(chunks[a], chunks[b])]
-    seams = {
-        (a, b): align(read(a), read(b), common_rows(chunks[a], chunks[b]), fixed_scale=fixed_scale) for a, b in pairs
-    }
+
+    def apart(a: int, b: int, sim3: Sequence[Sim3]) -> float | None:
+        return gap(read(a), read(b), common_rows(chunks[a], chunks[b]), sim3[a], sim3[b])
+
     if placed:
-        return Assembly(
-            joints=[
-                Joint(
-                    first=a, second=b, kind=_kind(chunks, a, b), seam=seam, reason=None,
-                    gap=gap(read(a), read(b), common_rows(chunks[a], chunks[b]), Sim3.identity(), Sim3.identity()),
-                )
-                for (a, b), seam in seams.items()
-            ],
-            sim3=[Sim3.identity() for _ in chunks],
-            pieces=[[number for number, chunk in enumerate(chunks) if not chunk.loop]],
-        )  # fmt: skip
-    good = [pair for pair in pairs if seams[pair].reason is None]
+        same = [Sim3.identity() for _ in chunks]
+        joints = [
+            Joint(first=a, second=b, kind=_kind(chunks, a, b), seam=seam, gap=apart(a, b, same), reason=None)
+            for (a, b), seam in seams.items()
+        ]
+        return Assembly(joints=joints, sim3=same, pieces=[list(range(len(chunks)))])
+    good = [pair for pair, seam in seams.items() if seam.reason is None]
     edges = [
         Edge.of(a, b, seams[a, b], robust=seams[a, b].doubt is not None or _kind(chunks, a, b) == "loop")
         for a, b in good
@@ -90,27 +114,30 @@ def assemble(
     trust = dict(zip(good, found.trust, strict=True))
     of = {number: k for k, piece in enumerate(found.pieces) for number in piece}
     joints = []
-    for a, b in pairs:
-        reason = seams[a, b].reason
-        if reason is None and trust[a, b] == 0:
-            reason = "it contradicts the other seams."
-        together = of[a] == of[b]
-        apart = None
-        if together:
-            apart = gap(read(a), read(b), common_rows(chunks[a], chunks[b]), found.sim3[a], found.sim3[b])
+    for (a, b), seam in seams.items():
+        reason = "it contradicts the other seams." if seam.reason is None and trust[a, b] == 0 else seam.reason
+        distance = apart(a, b, found.sim3) if of[a] == of[b] else None
         joints.append(
-            Joint(
-                first=a, second=b, kind=_kind(chunks, a, b), seam=seams[a, b], gap=apart,
-                reason=reason,
-            )
+            Joint(first=a, second=b, kind=_kind(chunks, a, b), seam=seam, gap=distance, reason=reason)
         )  # fmt: skip
-    pieces = [[number for number in piece if not chunks[number].loop] for piece in found.pieces]
-    size = {k: len({frame for number in piece for frame in chunks[number].frames}) for k, piece in enumerate(pieces)}
-    order = sorted((k for k in size if pieces[k]), key=lambda k: (-size[k], pieces[k]))
-    return Assembly(joints=joints, sim3=found.sim3, pieces=[pieces[k] for k in order])
+    pieces = [[number for number in piece if chunks[number].tie is None] for piece in found.pieces]
+    return Assembly(joints=joints, sim3=found.sim3, pieces=_largest_first(chunks, pieces))
+
+
+def _largest_first(chunks: Sequence[Chunk], pieces: Sequence[Sequence[int]]) -> list[list[int]]:
+    """Sort pieces by their numbers of frames; those whose frames larger ones have, all of them, are left out."""
+    frames = [{frame for number in piece for frame in chunks[number].frames} for piece in pieces]
+    taken: set[int] = set()
+    found = []
+    for k in sorted(range(len(pieces)), key=lambda k: (-len(frames[k]), pieces[k])):
+        if frames[k] - taken:
+            found.append(list(pieces[k]))
+            taken |= frames[k]
+    return found
 
 
 def _kind(chunks: Sequence[Chunk], a: int, b: int) -> Kind:
-    if chunks[a].loop or chunks[b].loop:
+    ties = [chunks[number].tie for number in (a, b)]
+    if "loop" in ties:
         return "loop"
-    return "neighbours" if b == a + 1 else "bridge"
+    return "neighbours" if ties == [None, None] and b == a + 1 else "bridge"

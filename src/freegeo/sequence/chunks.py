@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from freegeo.errors import UserError
 
@@ -17,8 +18,9 @@ class Chunk:
 
     frames: tuple[int, ...]
     """Ascending."""
-    loop: bool = False
-    """Whether it only ties two places of the sequence together, and gives no frames to the result."""
+    tie: Literal["loop", "bridge"] | None = None
+    """What it ties together, where it gives no frames to the result: two places that look alike, or the frames around
+    a seam that does not hold."""
 
     def __str__(self) -> str:
         """Return its frames, such as "12-35", or "12-19 and 280-287"."""
@@ -42,6 +44,13 @@ def plan_chunks(count: int, size: int, overlap: int) -> list[Chunk]:
     step = size - overlap
     chunks = max(1, -(-(count - overlap) // step))
     return [Chunk(frames=tuple(range(k * step, min(k * step + size, count)))) for k in range(chunks)]
+
+
+def bridge(first: Chunk, second: Chunk, size: int) -> Chunk:
+    """Return the frames around the middle of what two neighbouring chunks share, at most `size`."""
+    middle = (second.frames[0] + first.frames[-1] + 1) // 2
+    start, end = max(first.frames[0], middle - size // 2), min(second.frames[-1] + 1, middle + size - size // 2)
+    return Chunk(frames=tuple(range(start, end)), tie="bridge")
 
 
 def common_rows(first: Chunk, second: Chunk) -> list[tuple[int, int]]:
