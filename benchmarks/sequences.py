@@ -105,7 +105,7 @@ def trajectory_error(T_cam_world: torch.Tensor, truth: torch.Tensor) -> tuple[fl
 
 def exact(arguments: argparse.Namespace) -> list[dict]:
     """Align true chunks that were moved, turned, scaled and disturbed."""
-    from freegeo.sequence.assembly import assemble
+    from freegeo.sequence.assembly import assemble, seams_between
     from freegeo.sequence.chunks import plan_chunks
 
     around = small(walk(arguments.seed, DOMAIN, arguments.frames))
@@ -116,7 +116,8 @@ def exact(arguments: argparse.Namespace) -> list[dict]:
         plan = plan_chunks(len(scene), 24, 12)
         disturbed = [moved_chunk(scene, chunk.frames, noise, outliers, number) for number, chunk in enumerate(plan)]
         began = time.perf_counter()
-        found = assemble(plan, lambda number, parts=disturbed: parts[number])
+        read = disturbed.__getitem__
+        found = assemble(plan, seams_between(plan, read), read)
         seconds = time.perf_counter() - began
         centres, true = [], []
         for chunk, part, sim3 in zip(plan, disturbed, found.sim3, strict=True):
@@ -169,7 +170,7 @@ def whole_walk(arguments: argparse.Namespace) -> list[dict]:
     around = walk(arguments.seed, DOMAIN, arguments.frames, alike=arguments.alike)
     photos = written_photos(around, arguments.work / f"photos-{'alike' if arguments.alike else 'plain'}")
     rows = []
-    for size in (16, 24, 32):
+    for size in (12, 16, 24):
         for overlap in (size // 2, size // 4):
             for loops in (True, False):
                 out = photos.parent / f"{photos.name}-{size}-{overlap}-{'loops' if loops else 'no-loops'}"
