@@ -57,7 +57,10 @@ def test_the_page_names_the_seam_that_failed_and_leads_to_the_other_pieces(folde
         (link,) = re.findall('href="([^"]*)"', top)
         assert (folder / link).resolve() == (other / "report.html").resolve()
         assert "120 frames, in the order given, predicted in 7 chunks of up to 24 frames" in text
-        assert "1 of 6 seams between neighbours could not be used. 1 of 2 loops (places seen twice) used. 2 pieces." in text
+        assert (
+            "1 of 6 seams between neighbours could not be used. 1 of 2 loops (places seen twice) used. 2 pieces."
+            in text
+        )
 
 
 def test_a_missing_chunk_and_a_bridge_are_told(tmp_path):
@@ -80,7 +83,10 @@ def test_seams_of_loops_and_chunks_without_a_seam_are_told(pieces):
     refused = {**content["seams"][0], "first": 1, "second": 9, "kind": "loop", "used": False, "reason": "It is apart."}
     seams = [refused, *(seam for seam in content["seams"] if seam["second"] != CUT)]
     told = sequence.told(replace(found, summary={"sequence": {**content, "seams": seams}}))
-    assert "5 seams between neighbours, all used." in told.sentences and "1 seam of loops could not be used." in told.sentences
+    assert (
+        "5 seams between neighbours, all used." in told.sentences
+        and "1 seam of loops could not be used." in told.sentences
+    )
     assert told.seams.rows[0].cells[0] == "1–9, loop" and not told.seams.rows[0].is_used
     assert told.problems == [
         "Chunks 3 and 4 (frames 48 to 71, and frames 64 to 87) could not be joined: they share no frames."

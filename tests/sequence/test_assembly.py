@@ -1,0 +1,99 @@
+"""Chunks put together: places, pieces, bridges, and what is said of each seam."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from exact_rooms import room
+from freegeo.export.reconstruction import Reconstruction
+from freegeo.geometry.se3 import camera_centres
+from freegeo.sequence.assembly import assemble, broken, seams_between
+from freegeo.sequence.chunks import Chunk, bridge, plan_chunks
+from sequence.test_join import part_of, similarity
+
+FRAMES, HW = 14, (24, 32)
+
+
+@pytest.fixture(scope="module")
+def whole() -> Reconstruction:
+    return room(FRAMES, HW)
+
+
+def noise(part: Reconstruction) -> Reconstruction:
+    """The same with depth that fits nothing."""
+    factor = np.random.default_rng(0).lognormal(0, 1, part.depth_z.shape)
+    return replace(part, depth_z=(part.depth_z * factor).astype(np.float32))
+
+
+def put_together(whole: Reconstruction, chunks: list[Chunk], *lost: int, **options):
+    parts = [part_of(whole, chunk, similarity(number)) for number, chunk in enumerate(chunks)]
+    parts = [noise(part) if number in lost else part for number, part in enumerate(parts)]
+    return assemble(chunks, seams_between(chunks, parts.__getitem__), parts.__getitem__, **options), parts
+
+
+def test_chunks_in_frames_of_their_own_come_together(whole):
+    chunks = plan_chunks(FRAMES, 6, 2)
+    found, parts = put_together(whole, chunks)
+    assert found.pieces == [list(range(len(chunks)))]
+    assert [joint.kind for joint in found.joints] == ["neighbours"] * (len(chunks) - 1)
+    assert all(joint.reason is None and joint.gap is not None and joint.gap < 1e-4 for joint in found.joints)
+    first = similarity(0)
+    true = first.apply(camera_centres(torch.from_numpy(whole.cameras()[0]).double()))
+    for chunk, part, sim3 in zip(chunks, parts, found.sim3, strict=True):
+        moved = camera_centres(sim3.apply_to_cameras(torch.from_numpy(part.cameras()[0]).double()))
+        torch.testing.assert_close(moved, true[list(chunk.frames)], atol=1e-3, rtol=0)
+
+
+def test_a_chunk_that_fits_nowhere_leaves_pieces_that_share_no_frame(whole):
+    chunks = plan_chunks(FRAMES, 6, 2)
+    found, _ = put_together(whole, chunks, 1)
+    assert found.pieces == [[0], [1], [2]]
+    assert [joint.reason is None for joint in found.joints] == [False, False]
+    assert all(joint.gap is None for joint in found.joints)
+
+
+def test_where_more_frames_are_shared_a_lost_chunk_is_passed_over(whole):
+    chunks = plan_chunks(FRAMES, 6, 4)
+    found, _ = put_together(whole, chunks, 2)
+    assert found.pieces == [[0, 1, 3, 4]]
+    assert {(joint.first, joint.second): joint.kind for joint in found.joints}[1, 3] == "bridge"
+
+
+def test_the_frames_around_a_seam_tie_chunks_together(whole):
+    chunks = plan_chunks(FRAMES, 8, 2)
+    parts = [part_of(whole, chunk, similarity(number)) for number, chunk in enumerate(chunks)]
+    # What the two share is lost in the second one.
+    depth = parts[1].depth_z.copy()
+    depth[:2] = noise(parts[1]).depth_z[:2]
+    parts[1] = replace(parts[1], depth_z=depth)
+    seams = seams_between(chunks, parts.__getitem__)
+    assert broken(chunks, seams) == [(0, 1)]
+    tie = bridge(chunks[0], chunks[1], 8)
+    assert tie.frames == tuple(range(3, 11))
+    chunks, parts = [*chunks, tie], [*parts, part_of(whole, tie, similarity(9))]
+    found = assemble(chunks, seams_between(chunks, parts.__getitem__, known=seams), parts.__getitem__)
+    assert found.pieces == [[0, 1]]
+    assert [(joint.kind, joint.reason is None) for joint in found.joints] == [
+        ("neighbours", False), ("bridge", True), ("bridge", True),
+    ]  # fmt: skip
+
+
+def test_seams_that_are_known_are_not_measured_again(whole):
+    chunks = plan_chunks(FRAMES, 6, 2)
+    parts = [part_of(whole, chunk, similarity(number)) for number, chunk in enumerate(chunks)]
+    seams = seams_between(chunks, parts.__getitem__)
+    reads = []
+    assert seams_between(chunks, reads.append, known=seams) == seams
+    assert reads == []
+
+
+def test_chunks_of_known_cameras_are_measured_and_not_moved(whole):
+    chunks = plan_chunks(FRAMES, 6, 2)
+    parts = [part_of(whole, chunk, similarity(0)) for chunk in chunks]
+    parts[1] = replace(parts[1], depth_z=parts[1].depth_z * np.float32(1.02))
+    found = assemble(chunks, seams_between(chunks, parts.__getitem__), parts.__getitem__, placed=True)
+    assert all(float(sim3.s) == 1 and torch.equal(sim3.R, torch.eye(3).double()) for sim3 in found.sim3)
+    # Along the ray, which is longer than the depth.
+    assert all(joint.gap is not None and 0.02 <= joint.gap < 0.024 for joint in found.joints)
