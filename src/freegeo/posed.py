@@ -26,9 +26,8 @@ from freegeo.evidence.refinement import measured_depth
 from freegeo.export.photos import own_file
 from freegeo.export.pixels import HALF
 from freegeo.export.reconstruction import Reconstruction, Scale
-from freegeo.geometry.rotation import mean_rotation, rotation_angle
 from freegeo.geometry.se3 import camera_centres
-from freegeo.geometry.sim3 import Sim3
+from freegeo.geometry.sim3 import NORMAL, CameraFit, DegenerateAlignmentError, fit_cameras
 from freegeo.models.priors import unusable
 from freegeo.models.spec import ModelSpec
 from freegeo.types import ImageBatch, PhotoLike, Priors
@@ -41,16 +40,12 @@ logger = logging.getLogger(__name__)
 FARTHEST = 1000.0
 """Distance of known cameras from the origin, in distances of the cameras farthest apart, above which they are refused:
 points and meshes are float32, and would be rounded to more than 1e-4 of that distance."""
-SHORT_PAIR = 0.05
-"""Pairs of known cameras nearer to each other than this share of the longest distance have no say in the scale."""
 DOUBTFUL_DEG, DOUBTFUL_SHARE, DOUBTFUL_SPREAD, DOUBTFUL_FOCAL = 10.0, 0.2, 0.3, 0.05
 """From here on a difference between predicted and known cameras is a warning: median angle, median distance as a share
 of the longest one between known cameras, spread of the pairs' scale, and relative difference of focal lengths."""
 _EXIF, _CAMERA_TAGS, _FOCAL_TAGS = 0x8769, (0x010F, 0x0110), (0x920A, 0xA405)
 EXIF_FACTOR = 1.3
 """Factor, up or down, from which on EXIF data and a result contradict each other: both are wrong by some per cent."""
-NORMAL = 1.4826
-"""Standard deviation of a normal distribution in its median absolute deviations."""
 
 
 def known_cameras(
@@ -164,68 +159,15 @@ def model_K(known: KnownCameras, scale_xy: Tensor, offset_xy: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Fit:
-    """How predicted cameras are brought to known ones."""
-
-    sim3: Sim3
-    """From the world of the prediction to that of the known cameras."""
-    has_scale: bool
-    """Whether the known cameras give a scale; else that of the prediction stays."""
-    spread: float | None
-    """Relative spread (one standard deviation) of the scales that pairs of cameras give; None: one pair or none."""
-    rotation_deg: float
-    """Median angle between predicted and known cameras."""
-    position: float | None
-    """Median distance between predicted and known cameras, as a share of the longest one between known cameras."""
-
-
-def fit_cameras(predicted: Tensor, known: Tensor) -> Fit:
-    """Fit predicted cameras (S, 4, 4) to known ones of the same views.
-
-    The rotation is the mean over the cameras, the scale the median over pairs of the ratio of their distances, and the
-    translation the median over the centres: unlike a fit to the centres alone this needs no more than two cameras, and
-    they may be on one line. FreeGeoError when the predicted cameras are all in one place, and the known ones are not.
-    """
-    predicted, known = predicted.double(), known.double()
-    R = mean_rotation(known[:, :3, :3].mT @ predicted[:, :3, :3])
-    here, there = camera_centres(predicted), camera_centres(known)
-    first, second = torch.triu_indices(len(here), len(here), 1)
-    distance, wanted = ((x[first] - x[second]).norm(dim=-1) for x in (here, there))
-    longest = float(wanted.max()) if len(wanted) else 0.0
-    has_scale = longest > 1e-9 * float(there.abs().max())
-    scale, spread = 1.0, None
-    if has_scale:
-        far = wanted > SHORT_PAIR * longest
-        logs = (wanted[far] / distance[far]).log()
-        scale = float(logs.quantile(0.5).exp())
-        if not 0 < scale < float("inf"):
-            raise FreeGeoError(
-                "the model predicts all cameras in one place, so that its depth cannot be brought to the scale of the "
-                "known ones. Use photos with more motion, or another model."
-            )
-        if len(logs) > 1:
-            spread = NORMAL * float((logs - logs.quantile(0.5)).abs().quantile(0.5))
-    t = (there - scale * here @ R.mT).quantile(0.5, dim=0)
-    sim3 = Sim3(s=torch.tensor(scale, dtype=torch.float64), R=R, t=t)
-    moved = sim3.apply_to_cameras(predicted)
-    apart = (camera_centres(moved) - there).norm(dim=-1).quantile(0.5)
-    angle = rotation_angle(moved[:, :3, :3], known[:, :3, :3]).quantile(0.5)
-    return Fit(
-        sim3=sim3, has_scale=has_scale, spread=spread, rotation_deg=float(torch.rad2deg(angle)),
-        position=float(apart) / longest if has_scale else None,
-    )  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Posed:
     """A prediction with known cameras."""
 
     result: Reconstruction
     about: Mapping[str, Any]
     """JSON-like: `source`, `poses` and `intrinsics` (how many are known), `metric`, `scale`, `spread`, `rotation_deg`,
-    `position` (`Fit`), `focal` (median ratio of known to predicted focal lengths); None where there is none. With
-    `with_measured_depth` also `measured`: `points`, `views` with enough of them, `factor` and `spread` over the views
-    (None: one view); None where too few were measured."""
+    `position` (`freegeo.geometry.sim3.CameraFit`), `focal` (median ratio of known to predicted focal lengths); None
+    where there is none. With `with_measured_depth` also `measured`: `points`, `views` with enough of them, `factor` and
+    `spread` over the views (None: one view); None where too few were measured."""
 
 
 def with_known_cameras(prediction: Reconstruction, known: KnownCameras) -> Posed:
@@ -248,7 +190,13 @@ def with_known_cameras(prediction: Reconstruction, known: KnownCameras) -> Posed
     scale, depth_z, fit, focal = prediction.scale, prediction.depth_z, None, None
     if has_pose.any():
         given = _poses(known)
-        fit = fit_cameras(T[has_pose], given)
+        try:
+            fit = fit_cameras(T[has_pose], given)
+        except DegenerateAlignmentError:
+            raise FreeGeoError(
+                "the model predicts all cameras in one place, so that its depth cannot be brought to the scale of the "
+                "known ones. Use photos with more motion, or another model."
+            ) from None
         T = fit.sim3.apply_to_cameras(T)
         T[has_pose] = given
         factor = float(fit.sim3.s)
@@ -325,7 +273,7 @@ def doubt_focal_length(result: Reconstruction, photos: Sequence[PhotoLike]) -> N
         )
 
 
-def _doubt_poses(fit: Fit, known: KnownCameras, scale: Scale | None) -> None:
+def _doubt_poses(fit: CameraFit, known: KnownCameras, scale: Scale | None) -> None:
     source = known.source
     if not fit.has_scale:
         count = "one known pose gives" if known.has_pose.sum() == 1 else "the known poses are all in one place and give"

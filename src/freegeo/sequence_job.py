@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -125,20 +125,18 @@ class SequenceJob(Job):
         loops, tied = self._loops() if self.plan.loops else ([], [])
         numbers = [number for number in range(len(chunks)) if number not in self.failed]
         parts = [*(chunks[number] for number in numbers), *tied]
-        load = [self._reader(_chunk_name(number)) for number in numbers] + [
-            self._reader(_tie_name(tie)) for tie in tied
-        ]
+        names = [*map(_chunk_name, numbers), *map(_tie_name, tied)]
         with self._timed("seams between chunks", JOINING):
-            seams = seams_between(parts, lambda number: load[number](), fixed_scale=self.spec.metric)
+            seams = self._seams(parts, names)
         if not self._is_placed:
-            for tie in self._bridges(parts, seams):
-                parts.append(tie)
-                load.append(self._reader(_tie_name(tie)))
+            bridges = self._bridges(parts, seams)
+            parts, names = [*parts, *bridges], [*names, *map(_tie_name, bridges)]
         with self._timed("places of chunks", JOINING):
-            seams = seams_between(parts, lambda number: load[number](), fixed_scale=self.spec.metric, known=seams)
             found = assemble(
-                parts, seams, lambda number: load[number](), fixed_scale=self.spec.metric, placed=self._is_placed
-            )
+                parts, self._seams(parts, names, seams), self._reader(names), fixed_scale=self.spec.metric,
+                placed=self._is_placed,
+            )  # fmt: skip
+        load = [partial(self._reader(names), k) for k in range(len(names))]
         pieces = [[Member(chunk=parts[k], sim3=found.sim3[k], load=load[k]) for k in piece] for piece in found.pieces]
         told = self._told_of(chunks, numbers, found, loops, pieces)
         return self._write(pieces, told, adaptation)
@@ -316,8 +314,9 @@ class SequenceJob(Job):
         matches = find_matches([self.photos[frame] for frame in loop.frames])
         return agrees(Candidate.of(found, str(self.compute.device)), chunk.frames, loop, matches).reason
 
-    def _bridges(self, parts: Sequence[Chunk], seams: Seams) -> Iterator[Chunk]:
+    def _bridges(self, parts: Sequence[Chunk], seams: Seams) -> list[Chunk]:
         """Predict the frames around each seam that does not hold together, which may tie its chunks."""
+        found = []
         for a, b in broken(parts, seams):
             tie = bridge(parts[a], parts[b], self.plan.size)
             try:
@@ -327,10 +326,17 @@ class SequenceJob(Job):
             except FreeGeoError as error:
                 logger.info("no bridge over frames %s: %s", tie, error)
             else:
-                yield tie
+                found.append(tie)
+        return found
 
-    def _reader(self, name: str) -> Callable[[], Reconstruction]:
-        return partial(Reconstruction.load, self.folder / CHUNKS_FOLDER / name)
+    def _seams(self, parts: Sequence[Chunk], names: Sequence[str], known: Seams | None = None) -> Seams:
+        refined = self.folder.notes.get("refinement") or {}
+        measured = [k for k, name in enumerate(names) if refined.get(f"{CHUNKS_FOLDER}/{name}", {}).get("accepted")]
+        return seams_between(parts, self._reader(names), fixed_scale=self.spec.metric, measured=measured, known=known)
+
+    def _reader(self, names: Sequence[str]) -> Callable[[int], Reconstruction]:
+        """Return what reads the prediction of a chunk by its number among the names."""
+        return lambda number: Reconstruction.load(self.folder / CHUNKS_FOLDER / names[number])
 
     @property
     def _is_placed(self) -> bool:

@@ -136,19 +136,30 @@ def test_a_stopped_run_continues_at_the_first_chunk_that_is_not_finished(freegeo
     assert len(oracle.asked) == COUNT
 
 
-def test_chunks_that_do_not_fit_are_delivered_as_pieces(freegeo, walk, tiny, tmp_path, oracle):
-    def unlike(number: int, result: Reconstruction) -> Reconstruction:
-        if number < 2:
-            return result
-        noise = np.random.default_rng(0).lognormal(0, 1, result.depth_z.shape)
-        return replace(result, depth_z=(result.depth_z * (noise if number == 2 else 1)).astype(np.float32))
+def unlike(result: Reconstruction) -> Reconstruction:
+    """An answer whose depth fits nothing."""
+    noise = np.random.default_rng(0).lognormal(0, 1, result.depth_z.shape)
+    return replace(result, depth_z=(result.depth_z * noise).astype(np.float32))
 
-    oracle.change = unlike
+
+def test_a_chunk_that_fits_nowhere_is_bridged_by_the_frames_around_its_seams(freegeo, walk, tiny, tmp_path, oracle):
+    oracle.change = lambda number, result: unlike(result) if number == 2 else result
+    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS)
+    assert outcome.code == 0, outcome.err
+    assert oracle.asked[COUNT:] == [tuple(f"{k:02d}.png" for k in range(*ends)) for ends in ((4, 10), (7, 13))]
+    about = told(tmp_path / "out")["sequence"]
+    assert [chunk["piece"] for chunk in about["chunks"]] == [0, 0, None, 0]
+    assert [seam["used"] for seam in about["seams"] if seam["kind"] == "neighbours"] == [True, False, False]
+    assert open_reconstruction(tmp_path / "out").names == tuple(f"{k:02d}.png" for k in range(FRAMES))
+
+
+def test_chunks_that_do_not_fit_are_delivered_as_pieces(freegeo, walk, tiny, tmp_path, oracle):
+    oracle.change = lambda number, result: unlike(result) if number == 2 or number >= COUNT else result
     outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS)
     assert outcome.code == 3
     assert "of 14 photos are in the result" in outcome.err
     about = told(tmp_path / "out")["sequence"]
-    assert [seam["used"] for seam in about["seams"]] == [True, False, False]
+    assert [seam["used"] for seam in about["seams"] if seam["kind"] == "neighbours"] == [True, False, False]
     assert all(seam["reason"] for seam in about["seams"] if not seam["used"])
     folders = [tmp_path / "out" / piece["folder"] for piece in about["pieces"]]
     names = [name for folder in folders for name in open_reconstruction(folder).names]

@@ -242,6 +242,24 @@ def test_a_seam_that_fits_badly_is_used_and_doubted():
     assert align(first, second, ROWS).doubt is None
 
 
+def test_measured_cameras_make_the_seam_where_those_of_both_chunks_agree():
+    first, second = chunk([0, 1, 2, 3]), chunk([1, 2, 3, 4], MOVE)
+    rows = [(1, 0), (2, 1), (3, 2)]
+    bent = replace(second, depth_z=second.depth_z * np.float32(1.4))
+    by_points, by_cameras = align(first, bent, rows), align(first, bent, rows, measured=True)
+    assert not by_points.by_cameras
+    assert by_cameras.by_cameras
+    difference = (by_cameras.sim3 @ MOVE).log()
+    assert float(difference.abs().max()) < 1e-3
+    assert float((by_points.sim3 @ MOVE).log().abs().max()) > 0.1
+    assert by_cameras.doubt is not None
+    assert by_cameras.sure
+    turned = bent.cameras()[0].copy()
+    turned[:, :3] = Sim3.exp(torch.tensor([0.2, 0, 0, 0, 0, 0, 0]).double()).R.numpy() @ turned[:, :3]
+    turned[1] = bent.cameras()[0][1]
+    assert not align(first, replace(bent, T_cam_world=turned), rows, measured=True).by_cameras
+
+
 def test_a_narrow_strip_does_not_fix_a_turn():
     def strip(one):
         wall = 3 * np.exp(0.02 * np.random.default_rng(len(one)).standard_normal(one.depth_z.shape))

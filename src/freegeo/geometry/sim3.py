@@ -11,13 +11,26 @@ import torch
 from torch import Tensor
 
 from freegeo.errors import UserError
-from freegeo.geometry.rotation import matrix_to_quat_xyzw, rotate
+from freegeo.geometry.rotation import matrix_to_quat_xyzw, mean_rotation, rotate, rotation_angle
 from freegeo.geometry.se3 import camera_centres, from_Rt, to_4x4
 
-__all__ = ["CameraAlignment", "DegenerateAlignmentError", "Sim3", "align_cameras", "umeyama"]
+__all__ = [
+    "NORMAL",
+    "CameraAlignment",
+    "CameraFit",
+    "DegenerateAlignmentError",
+    "Sim3",
+    "align_cameras",
+    "fit_cameras",
+    "umeyama",
+]
 
 # Collinear float32 positions leave a second singular value of about 1e-14 of the first: rounding, not geometry.
 SMALLEST_SINGULAR_RATIO = 1e-12
+SHORT_PAIR = 0.05
+"""Pairs of cameras nearer to each other than this share of the longest distance have no say in a scale."""
+NORMAL = 1.4826
+"""Standard deviation of a normal distribution in its median absolute deviations."""
 
 
 class DegenerateAlignmentError(UserError):
@@ -231,6 +244,56 @@ def _exponential(axis_angle: Tensor, log_scale: Tensor) -> tuple[Tensor, Tensor]
     upper = torch.cat((A, eye), dim=-1)
     both = torch.linalg.matrix_exp(torch.cat((upper, torch.zeros_like(upper)), dim=-2))
     return both[..., :3, :3], both[..., :3, 3:]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraFit:
+    """How cameras are brought to other ones of the same views, which are known."""
+
+    sim3: Sim3
+    """From the world of the cameras to that of the known ones."""
+    has_scale: bool
+    """Whether the known cameras give a scale; else it is 1."""
+    spread: float | None
+    """Relative spread (one standard deviation) of the scales that pairs of cameras give; None: one pair or none."""
+    rotation_deg: float
+    """Median angle between the cameras and the known ones."""
+    position: float | None
+    """Median distance between them, as a share of the longest one between known cameras; None without a scale."""
+
+
+def fit_cameras(predicted: Tensor, known: Tensor) -> CameraFit:
+    """Fit cameras (S, 4, 4) to known ones of the same views.
+
+    The rotation is the mean over the cameras, the scale the median over pairs of the ratio of their distances, and the
+    translation the median over the centres: unlike a fit to the centres alone this needs no more than two cameras, and
+    they may be on one line. DegenerateAlignmentError when the cameras are all in one place and the known ones are not.
+    """
+    predicted, known = predicted.double(), known.double()
+    R = mean_rotation(known[:, :3, :3].mT @ predicted[:, :3, :3])
+    here, there = camera_centres(predicted), camera_centres(known)
+    first, second = torch.triu_indices(len(here), len(here), 1)
+    distance, wanted = ((x[first] - x[second]).norm(dim=-1) for x in (here, there))
+    longest = float(wanted.max()) if len(wanted) else 0.0
+    has_scale = longest > 1e-9 * float(there.abs().max())
+    scale, spread = 1.0, None
+    if has_scale:
+        far = wanted > SHORT_PAIR * longest
+        logs = (wanted[far] / distance[far]).log()
+        scale = float(logs.quantile(0.5).exp())
+        if not 0 < scale < float("inf"):
+            raise DegenerateAlignmentError("Cannot align cameras in one place; use photos with more motion.")
+        if len(logs) > 1:
+            spread = NORMAL * float((logs - logs.quantile(0.5)).abs().quantile(0.5))
+    t = (there - scale * here @ R.mT).quantile(0.5, dim=0)
+    sim3 = Sim3(s=torch.tensor(scale, dtype=torch.float64), R=R, t=t)
+    moved = sim3.apply_to_cameras(predicted)
+    apart = (camera_centres(moved) - there).norm(dim=-1).quantile(0.5)
+    angle = rotation_angle(moved[:, :3, :3], known[:, :3, :3]).quantile(0.5)
+    return CameraFit(
+        sim3=sim3, has_scale=has_scale, spread=spread, rotation_deg=float(torch.rad2deg(angle)),
+        position=float(apart) / longest if has_scale else None,
+    )  # fmt: skip
 
 
 def _draw_subsets(count: int, size: int, iterations: int, seed: int) -> list[list[int]]:

@@ -18,7 +18,7 @@ from torch import Tensor
 from freegeo.errors import FreeGeoError
 from freegeo.fusion.settings import FilterSettings
 from freegeo.geometry.se3 import camera_centres, inverse, transform_points
-from freegeo.geometry.sim3 import DegenerateAlignmentError, ScaleRule, Sim3, umeyama
+from freegeo.geometry.sim3 import DegenerateAlignmentError, ScaleRule, Sim3, fit_cameras, umeyama
 
 __all__ = ["FEWEST_INLIERS", "INLIER", "Depths", "Seam", "align", "gap"]
 
@@ -32,6 +32,9 @@ LARGEST_SCALE = 20.0
 """A chunk that is larger or smaller than its neighbour by more than this factor is not believed."""
 LARGEST_LEVERAGE = 0.5
 """Largest residual, relative to the second largest extent of the shared points: narrower ones leave a turn open."""
+CAMERAS_APART, CAMERAS_TURNED_DEG = 0.1, 2.0
+"""Median differences of the cameras of shared frames up to which those of two chunks agree: distance, as a share of the
+longest one between them, and angle."""
 BLANK = 2.0
 """Standard deviation of the colours (0 to 255) below which a frame shows nothing."""
 
@@ -102,6 +105,8 @@ class Seam:
     """Mean (3,) of the shared points in the second chunk's frame."""
     depth: float
     """Median depth of the shared pixels in the second chunk's units."""
+    by_cameras: bool
+    """Whether the cameras of the shared frames make the seam, not their points."""
     reason: str | None
     """A sentence that says why the seam cannot be used; None: it can."""
     doubt: str | None
@@ -110,7 +115,12 @@ class Seam:
     @property
     def weight(self) -> float:
         """How much the seam counts where it meets others."""
-        return self.inliers
+        return 1.0 if self.by_cameras else self.inliers
+
+    @property
+    def sure(self) -> bool:
+        """Whether other seams may not overrule it."""
+        return self.by_cameras or self.doubt is None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +145,14 @@ class _Shared:
         return distance / (sim3.s * self.depth_first * self.depth_second).sqrt()
 
 
-def align(first: Depths, second: Depths, rows: Sequence[tuple[int, int]], *, fixed_scale: bool = False) -> Seam:
+def align(
+    first: Depths,
+    second: Depths,
+    rows: Sequence[tuple[int, int]],
+    *,
+    fixed_scale: bool = False,
+    measured: bool = False,
+) -> Seam:
     """Find how the chunk `second` lies in the frame of `first`.
 
     The sum of a Cauchy loss of `residuals` over at most 20 000 pixels is minimised, by least squares with new weights
@@ -146,6 +163,8 @@ def align(first: Depths, second: Depths, rows: Sequence[tuple[int, int]], *, fix
         second: the chunk that moves.
         rows: for each frame in both, its row in `first` and in `second`.
         fixed_scale: lengths of both are in one unit (metric models, known cameras), so the scale is 1.
+        measured: cameras of both are refined by matches, and surer than depth: the shared frames' cameras make the
+            seam, if those of both chunks agree.
 
     Returns:
         The seam; `reason` says why it cannot be trusted.
@@ -165,8 +184,10 @@ def align(first: Depths, second: Depths, rows: Sequence[tuple[int, int]], *, fix
     count = 0 if shared is None else len(shared.weights)
     if shared is None or count < FEWEST_PIXELS:
         return _nothing(len(shown), count, f"only {count} pixels of the shared frames have a depth in both chunks.")
+    sim3 = _fit_cameras(first, second, shown) if measured and not fixed_scale else None
+    by_cameras = sim3 is not None
     try:
-        sim3 = _fit(shared, "one" if fixed_scale else "symmetric")
+        sim3 = sim3 or _fit(shared, "one" if fixed_scale else "symmetric")
     except DegenerateAlignmentError:
         return _nothing(len(shown), count, "the points of the shared frames lie on one line or in one place.")
     residuals = shared.residuals(sim3)
@@ -182,7 +203,8 @@ def align(first: Depths, second: Depths, rows: Sequence[tuple[int, int]], *, fix
         rms=rms,
         centre=shared.second.mean(0),
         depth=depth,
-        reason=_refusal(sim3, inliers, rms, _narrowness(shared.second[inlying] / depth)),
+        by_cameras=by_cameras,
+        reason=None if by_cameras else _refusal(sim3, inliers, rms, _narrowness(shared.second[inlying] / depth)),
         doubt=_doubt(inliers),
     )
 
@@ -215,6 +237,7 @@ def _nothing(frames: int, pixels: int, reason: str) -> Seam:
         rms=math.nan,
         centre=torch.zeros(3, dtype=torch.float64),
         depth=1.0,
+        by_cameras=False,
         reason=reason,
         doubt=None,
     )
@@ -312,6 +335,21 @@ def _fit(shared: _Shared, scale: ScaleRule) -> Sim3:
             if step < _CONVERGED:
                 break
     return sim3
+
+
+def _fit_cameras(first: Depths, second: Depths, rows: Sequence[tuple[int, int]]) -> Sim3 | None:
+    """Fit the shared frames' cameras to each other; None where they give no scale, or do not agree."""
+    T_first, T_second = (
+        torch.from_numpy(np.asarray(chunk.cameras()[0][[row[side] for row in rows]], np.float64))
+        for side, chunk in enumerate((first, second))
+    )
+    try:
+        fit = fit_cameras(T_second, T_first)
+    except DegenerateAlignmentError:
+        return None
+    if fit.position is None or fit.position > CAMERAS_APART or fit.rotation_deg > CAMERAS_TURNED_DEG:
+        return None
+    return fit.sim3
 
 
 def _narrowness(points: Tensor) -> float:

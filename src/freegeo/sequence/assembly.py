@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
@@ -58,7 +58,12 @@ class Assembly:
 
 
 def seams_between(
-    chunks: Sequence[Chunk], load: Load, *, fixed_scale: bool = False, known: Seams | None = None
+    chunks: Sequence[Chunk],
+    load: Load,
+    *,
+    fixed_scale: bool = False,
+    measured: Collection[int] = (),
+    known: Seams | None = None,
 ) -> dict[tuple[int, int], Seam]:
     """Align every two chunks that share frames.
 
@@ -66,13 +71,17 @@ def seams_between(
         chunks: those of the sequence in its order, and those that tie it together.
         load: reads the prediction of a chunk by its number here.
         fixed_scale: lengths of all chunks have one unit, such as metres: seams turn and move only.
+        measured: numbers of the chunks whose cameras are refined by matches.
         known: seams that were measured before.
     """
     read, found = lru_cache(maxsize=_OPEN)(load), dict(known or {})
     for pair in combinations(range(len(chunks)), 2):
         rows = common_rows(*(chunks[number] for number in pair))
         if rows and pair not in found:
-            found[pair] = align(read(pair[0]), read(pair[1]), rows, fixed_scale=fixed_scale)
+            found[pair] = align(
+                read(pair[0]), read(pair[1]), rows, fixed_scale=fixed_scale,
+                measured=all(number in measured for number in pair),
+            )  # fmt: skip
     return found
 
 
@@ -106,10 +115,7 @@ def assemble(
         ]
         return Assembly(joints=joints, sim3=same, pieces=[list(range(len(chunks)))])
     good = [pair for pair, seam in seams.items() if seam.reason is None]
-    edges = [
-        Edge.of(a, b, seams[a, b], robust=seams[a, b].doubt is not None or _kind(chunks, a, b) == "loop")
-        for a, b in good
-    ]
+    edges = [Edge.of(a, b, seams[a, b], robust=_kind(chunks, a, b) == "loop" or not seams[a, b].sure) for a, b in good]
     found = place(len(chunks), edges, fixed_scale=fixed_scale)
     trust = dict(zip(good, found.trust, strict=True))
     of = {number: k for k, piece in enumerate(found.pieces) for number in piece}
