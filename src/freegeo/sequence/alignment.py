@@ -32,7 +32,7 @@ LARGEST_SCALE = 20.0
 """A chunk that is larger or smaller than its neighbour by more than this factor is not believed."""
 LARGEST_LEVERAGE = 0.5
 """Largest residual, relative to the second largest extent of the shared points: narrower ones leave a turn open."""
-CAMERAS_APART, CAMERAS_TURNED_DEG = 0.1, 2.0
+CAMERAS_APART, CAMERAS_TURNED_DEG = 0.1, 5.0
 """Median differences of the cameras of shared frames up to which those of two chunks agree: distance, as a share of the
 longest one between them, and angle."""
 BLANK = 2.0
