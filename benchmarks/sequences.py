@@ -1,11 +1,12 @@
 """Long sequences: accuracy, memory and robustness on a generated walk that comes back to its start.
 
-Run: python benchmarks/sequences.py PART [--frames 300] [--seed 20000000] [--work FOLDER] [--out FILE]
+Run: python benchmarks/sequences.py PART [--frames 300] [--seed 20000000] [--alike] [--refine] [--work FOLDER]
 
 `chunks`: what the embedded model does with chunks of several sizes, each alone: errors of cameras and depth.
 `exact`:  true depth and cameras; each chunk in its own random similarity frame, with noise and outliers. How far the
           seams and the graph are from the truth.
-`walk`:   error of the whole trajectory by chunk size, overlap and loops.
+`walk`:   error of the whole trajectory by chunk size, overlap and loops; with --refine, of chunks that are refined by
+          matches (docs/refinement.md), with half of a chunk shared.
 `memory`: peak memory of a fresh process against the number of frames, with a figure.
 `film`:   writes a walk as a video (--out FILE.mp4), by default of 1,000 frames.
 `video`:  time and peak memory of a video of 1,000 frames.
@@ -170,12 +171,14 @@ def whole_walk(arguments: argparse.Namespace) -> list[dict]:
     around = walk(arguments.seed, DOMAIN, arguments.frames, alike=arguments.alike)
     photos = written_photos(around, arguments.work / f"photos-{'alike' if arguments.alike else 'plain'}")
     rows = []
-    for size in (12, 16, 24):
-        for overlap in (size // 2, size // 4):
+    more = ["--refine", "ba"] if arguments.refine else []
+    for size in (12, 16) if arguments.refine else (12, 16, 24):
+        for overlap in (size // 2,) if arguments.refine else (size // 2, size // 4):
             for loops in (True, False):
-                out = photos.parent / f"{photos.name}-{size}-{overlap}-{'loops' if loops else 'no-loops'}"
+                name = f"{photos.name}-{size}-{overlap}-{'loops' if loops else 'no-loops'}"
+                out = photos.parent / (f"{name}-refined" if arguments.refine else name)
                 plan = ["--chunk", str(size), "--overlap", str(overlap), "--loops" if loops else "--no-loops"]
-                run([*plan, "--order", "given"], photos, out)
+                run([*plan, "--order", "given", *more], photos, out)
                 row = {"chunk": size, "overlap": overlap, "loops": loops} | walk_scores(out, around)
                 rows.append(row)
                 print(json.dumps(row), flush=True)
@@ -337,6 +340,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="of the walk")
     parser.add_argument("--seed", type=int, default=20_000_000)
     parser.add_argument("--alike", action="store_true", help="walk: two rooms look alike")
+    parser.add_argument("--refine", action="store_true", help="walk: refine chunks by matches")
     parser.add_argument("--work", type=Path, default=Path("sequences-work"))
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
@@ -347,9 +351,10 @@ def main() -> None:
         return
     rows = PARTS[arguments.part](arguments)
     print(table(rows))
-    name = f"sequence-{arguments.part}{'-alike' if arguments.alike else ''}.json"
+    kind = "".join(f"-{name}" for name in ("alike", "refine") if getattr(arguments, name))
+    name = f"sequence-{arguments.part}{kind}.json"
     path = arguments.out or Path(__file__).parent / "results" / name
-    settings = {name: getattr(arguments, name) for name in ("frames", "seed", "alike")}
+    settings = {name: getattr(arguments, name) for name in ("frames", "seed", "alike", "refine")}
     write_result(path, settings=settings, results={"rows": rows}, show=False)
 
 
