@@ -205,7 +205,7 @@ def align(
         depth=depth,
         by_cameras=by_cameras,
         reason=None if by_cameras else _refusal(sim3, inliers, rms, _narrowness(shared.second[inlying] / depth)),
-        doubt=_doubt(inliers),
+        doubt=_doubt(inliers, by_cameras=by_cameras),
     )
 
 
@@ -373,7 +373,11 @@ def _refusal(sim3: Sim3, inliers: float, rms: float, extent: float) -> str | Non
     return None
 
 
-def _doubt(inliers: float) -> str | None:
+def _doubt(inliers: float, *, by_cameras: bool) -> str | None:
     if inliers >= DOUBTFUL_INLIERS:
         return None
+    if by_cameras:
+        return (
+            f"the cameras fit, as matches measure them, and surfaces do not: {inliers:.0%} of the shared pixels agree."
+        )
     return f"the two chunks fit badly: only {inliers:.0%} of the shared pixels have one place."

@@ -29,7 +29,7 @@ SAME_PICTURE = 1e-5
 """Two frames whose similarity is nearer to 1 than this are one picture (a frozen camera, black frames)."""
 FEWEST_PAIRS = 2
 """Each of the two frames must have verified matches with so many of the three around the other one."""
-LEAST_SHARE = 1.0
+LEAST_SHARE = 0.8
 """Share of keypoints that match across a loop, over that of neighbours at one end which are about as alike."""
 LARGEST_RATIO, ALWAYS_GOOD_PX = 2.0, 2.0
 """The epipolar error across a loop may be so many times that at its ends, and always so many matching pixels."""
