@@ -255,7 +255,7 @@ def test_measured_cameras_make_the_seam_where_those_of_both_chunks_agree():
     assert by_cameras.doubt is not None
     assert by_cameras.sure
     turned = bent.cameras()[0].copy()
-    turned[:, :3] = Sim3.exp(torch.tensor([0.2, 0, 0, 0, 0, 0, 0]).double()).R.numpy() @ turned[:, :3]
+    turned[:, :3] = Sim3.exp(torch.tensor([0.6, 0, 0, 0, 0, 0, 0]).double()).R.numpy() @ turned[:, :3]
     turned[1] = bent.cameras()[0][1]
     assert not align(first, replace(bent, T_cam_world=turned), rows, measured=True).by_cameras
 
