@@ -51,6 +51,7 @@ from freegeo.pipeline import (
     other_use,
     predict,
     predict_unchecked,
+    scene_images,
     with_targets,
 )
 from freegeo.posed import (
@@ -141,8 +142,6 @@ class Job:
     folder: RunFolder
     recipe: Recipe | None
     """None: reconstruct with the frozen model, or with `adapter`."""
-    scene: Callable[[ReconstructionModel], SceneImages] | None = None
-    """Makes the images to adapt to (`scene_images`); needed with a recipe."""
     adapter: Path | None = None
     """A saved adapter to reconstruct with, instead of training one."""
     guard: Guard = "select"
@@ -200,6 +199,11 @@ class Job:
         if doubt:
             self._warn(f"{self.adapter}: an adapter to be doubted. {capital(doubt)}")
         return adapter_files.load_adapter(self.model, self.adapter)
+
+    @property
+    def _attached(self) -> Adapter | None:
+        """The adapter that is in the model by now, if any."""
+        return vars(self).get("in_place")
 
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
@@ -266,8 +270,7 @@ class Job:
         if "failed" in noted:
             return noted["failed"], None
         if not (folder / METADATA).is_file():
-            assert self.scene is not None
-            images, judging = [self.scene(self.model)], None
+            images, judging = [self._scene_images()], None
             try:
                 if recipe.cameras:
                     assert self.photos is not None and frozen is not None
@@ -298,6 +301,11 @@ class Job:
             self.folder.note("adaptation", {"seconds": seconds})
         metadata = read_json(folder / METADATA)
         return metadata.get("trouble"), metadata.get("verdict")
+
+    def _scene_images(self) -> SceneImages:
+        """Return the photos as a scene to adapt to."""
+        assert self.photos is not None and self.recipe is not None
+        return scene_images("photos", self.photos, self.model, self.recipe, self.batch, self.priors)
 
     def _judge(self, result: Adapted, frozen: Reconstruction | None, judging: list[Matches] | None) -> None:
         """Let the guard judge a finished adapter, and keep its verdict in the result."""
@@ -410,7 +418,7 @@ class Job:
     def _told(self, priors: Priors, *, is_frozen: bool) -> Reconstruction | None:
         """Predict again with the model of the result, which is told cameras; None without finite numbers."""
         # The adapter of a result that is the frozen model's may still be in place.
-        adapter = vars(self).get("in_place") if is_frozen else self.in_place
+        adapter = self._attached if is_frozen else self.in_place
         with adapter.off() if is_frozen and adapter is not None else nullcontext():
             found = predict_unchecked(
                 self.model, self.batch, reference=None, priors=priors, pose_from="camera", compute=self.compute

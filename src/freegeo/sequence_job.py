@@ -47,7 +47,7 @@ from freegeo.job import (
     write_files,
 )
 from freegeo.metres import Gps, in_metres
-from freegeo.pipeline import capital, judge_by_photos, scene_images
+from freegeo.pipeline import capital, judge_by_photos
 from freegeo.posed import doubt_focal_length, with_one_camera
 from freegeo.report.page import write_report
 from freegeo.run_folder import Part
@@ -105,6 +105,8 @@ class SequenceJob(Job):
     plan: Plan
     failed: dict[int, str] = field(default_factory=dict)
     """Chunk -> why there is no prediction of it."""
+    usable: dict[int, Chunk] = field(default_factory=dict)
+    """The chunks that the adapter is trained and judged on, by number: those with a frozen prediction."""
     uses_adapter: bool = False
     """Whether the result is that of the adapter, trained or given."""
     order: Literal["given", "similar"] = "given"
@@ -122,7 +124,7 @@ class SequenceJob(Job):
             self._attempt(chunks, number, ChunkJob.make)
         if len(self.failed) == len(chunks):
             raise FreeGeoError(f"no chunk could be predicted: {capital(next(iter(self.failed.values())))}")
-        loops, tied = self._loops() if self.plan.loops else ([], [])
+        loops, tied = self._loops() if self.plan.loops and not self._is_placed else ([], [])
         numbers = [number for number in range(len(chunks)) if number not in self.failed]
         parts = [*(chunks[number] for number in numbers), *tied]
         names = [*map(_chunk_name, numbers), *map(_tie_name, tied)]
@@ -218,24 +220,28 @@ class SequenceJob(Job):
             return Adaptation()
         for number in range(len(chunks)):
             self._attempt(chunks, number, ChunkJob.frozen)
-        self.numbers = [number for number in range(len(chunks)) if number not in self.failed]
-        self.chunks = [chunks[number] for number in self.numbers]
+        self.usable = {number: chunk for number, chunk in enumerate(chunks) if number not in self.failed}
+        if not self.usable:
+            return Adaptation()
         rejected, verdict = self._trained(self.recipe, None)
         used = rejected is None and not (verdict and self.guard == "select" and verdict["outcome"] != "adapted")
         if rejected is not None:
             self._warn(f"{capital(rejected)} The result is that of the frozen model.")
+        if not used and self._attached is not None:
+            # What is predicted from here on is the frozen model's, also when this process trained the adapter.
+            self._attached.detach()
+            del self.in_place
         return Adaptation(used=used, rejected=rejected, verdict=verdict)
 
-    def _scene_images(self, model: ReconstructionModel) -> SceneImages:
-        assert self.photos is not None and self.recipe is not None
-        images = scene_images("photos", self.photos, model, self.recipe, self.batch, self.priors)
-        return replace(images, windows=chunk_windows([chunk.frames for chunk in self.chunks]))
+    def _scene_images(self) -> SceneImages:
+        windows = chunk_windows([chunk.frames for chunk in self.usable.values()])
+        return replace(super()._scene_images(), windows=windows)
 
     def _judge(self, result: Adapted, frozen: Reconstruction | None, judging: list[Matches] | None) -> None:
         """Let the guard judge a finished adapter once, by all chunks."""
         assert self.photos is not None
         evidence = []
-        for number, chunk in zip(self.numbers, self.chunks, strict=True):
+        for number, chunk in self.usable.items():
             own, place = list(chunk.frames), self.folder / CHUNKS_FOLDER / _chunk_name(number)
             evidence.append(
                 Evidence(
@@ -582,6 +588,10 @@ class ChunkJob(Job):
     def in_place(self) -> Adapter | None:
         """The adapter of the whole sequence."""
         return self.whole.in_place
+
+    @property
+    def _attached(self) -> Adapter | None:
+        return self.whole._attached
 
     def make(self) -> Computed:
         """Write the result of the chunk; an adapter that was trained is judged already."""

@@ -130,7 +130,7 @@ def run_job(
     from freegeo.job import MATCHES_NAME, PARTS, SUMMARY_NAME, Job
     from freegeo.metres import read_scale
     from freegeo.models.images import look_at_photos, read_photos
-    from freegeo.pipeline import require_enough_photos, require_reference, scene_images
+    from freegeo.pipeline import require_enough_photos, require_reference
     from freegeo.posed import check_known, is_one_camera, told, undistorted_masks
     from freegeo.sequence_job import SEQUENCE_PARTS, SequenceJob
 
@@ -219,7 +219,6 @@ def run_job(
             command=console.command_line(), warnings=console.warned(), after=after, formats=formats, photos=photos,
             filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity, guard=guard,
             refine=refining, pose_from=pose_from, known=known, priors=priors, one_camera=one_camera, scale=scale,
-            scene=None if plan is None else lambda model: scene_images("photos", photos, model, plan, batch, priors),
         )  # fmt: skip
         summary = job.run()
         describe(summary, output.output)

@@ -113,7 +113,8 @@ def assemble(
             Joint(first=a, second=b, kind=_kind(chunks, a, b), seam=seam, gap=apart(a, b, same), reason=None)
             for (a, b), seam in seams.items()
         ]
-        return Assembly(joints=joints, sim3=same, pieces=[list(range(len(chunks)))])
+        pieces = [[number for number, chunk in enumerate(chunks) if chunk.tie is None]]
+        return Assembly(joints=joints, sim3=same, pieces=pieces)
     good = [pair for pair, seam in seams.items() if seam.reason is None]
     edges = [Edge.of(a, b, seams[a, b], robust=_kind(chunks, a, b) == "loop" or not seams[a, b].sure) for a, b in good]
     found = place(len(chunks), edges, fixed_scale=fixed_scale)
