@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,14 +18,14 @@ from freegeo.data.image_files import UnreadableImageError, opened
 from freegeo.errors import UserError
 from freegeo.export.photos import own_file
 from freegeo.export.pixels import HALF
-from freegeo.export.reconstruction import METRIC_MODEL, Reconstruction
+from freegeo.export.reconstruction import METRIC_MODEL, Reconstruction, Scale
 from freegeo.geometry.se3 import camera_centres
 from freegeo.geometry.sim3 import umeyama
 
 if TYPE_CHECKING:
     from freegeo.types import PhotoLike
 
-__all__ = ["Distances", "Gps", "Measured", "ScaleSource", "in_metres", "read_scale"]
+__all__ = ["Distances", "Gps", "Measured", "ScaleSource", "in_metres", "read_scale", "scale_to_metres"]
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +36,8 @@ CONTRADICTION = 0.02
 """Relative difference from which two statements about the length of a metre contradict each other."""
 DISTANCES_APART = 0.05
 """Spread of the factors of several distances from which a warning says so."""
+FEWEST_POSITIONS = 3
+"""GPS positions that a scale takes."""
 GPS_SPREAD = 0.25
 """Error of GPS positions, in the extent of the path, above which they give no scale."""
 GPS_OUTLIER = 3.0
@@ -63,6 +65,10 @@ class Distances:
     """Distances that the user measured."""
 
     measured: tuple[Measured, ...]
+
+    def among(self, names: Collection[str]) -> Distances:
+        """Return the distances between places that photos of these names show."""
+        return Distances(tuple(one for one in self.measured if set(one.photos) <= set(names)))
 
 
 @dataclass(frozen=True)
@@ -130,7 +136,15 @@ def _measured(line: str, sizes: dict[str, tuple[int, int]]) -> Measured:
 
 
 def in_metres(result: Reconstruction, source: ScaleSource, photos: Sequence[PhotoLike]) -> Reconstruction:
-    """Bring a reconstruction to metres; what is surer wins: distances, then known cameras in metres, then GPS.
+    """Bring a reconstruction to metres (`scale_to_metres`); it comes back as it is where it is sure of them already."""
+    found = scale_to_metres(result, source, photos)
+    return result if found is None else result.scaled(found.value, source=found.source, spread=found.spread)
+
+
+def scale_to_metres(result: Reconstruction, source: ScaleSource, photos: Sequence[PhotoLike]) -> Scale | None:
+    """Return what brings a reconstruction to metres; None where lengths are metres that are surer than the source.
+
+    What is surer wins: distances, then known cameras in metres, then GPS.
 
     Raises:
         UserError: a place without depth, GPS positions that do not fit the cameras, or no cameras.
@@ -138,10 +152,10 @@ def in_metres(result: Reconstruction, source: ScaleSource, photos: Sequence[Phot
     if isinstance(source, Gps):
         if result.scale is not None and result.scale.source != METRIC_MODEL:
             logger.info("lengths are metres from %s already: GPS positions are not used", result.scale.source)
-            return result
+            return None
         factor, spread = _factor_of_gps(result, source)
         logger.info("GPS positions of %d photos: scale %.4g, to %.1f %%", len(source.views), factor, 100 * spread)
-        return result.scaled(factor, source="GPS positions of the photos", spread=spread)
+        return Scale(value=factor, source="GPS positions of the photos", spread=spread)
     logs = np.log([one.metres / _length(result, one, photos) for one in source.measured])
     factor, spread = float(np.exp(np.median(logs))), float(logs.std(ddof=1)) if len(logs) > 1 else None
     if spread is not None and spread > DISTANCES_APART:
@@ -156,7 +170,7 @@ def in_metres(result: Reconstruction, source: ScaleSource, photos: Sequence[Phot
             factor, result.scale.source,
         )  # fmt: skip
     count = "a measured distance" if len(logs) == 1 else f"{len(logs)} measured distances"
-    return result.scaled(factor, source=count, spread=spread)
+    return Scale(value=factor, source=count, spread=spread)
 
 
 def _length(result: Reconstruction, measured: Measured, photos: Sequence[PhotoLike]) -> float:
@@ -230,10 +244,10 @@ def _factor_of_gps(result: Reconstruction, gps: Gps) -> tuple[float, float]:
 
 def _gps_of(photos: Sequence[PhotoLike]) -> Gps:
     found = {view: place for view, photo in enumerate(photos) if (place := _gps_position(photo)) is not None}
-    if len(found) < 3:
+    if len(found) < FEWEST_POSITIONS:
         raise UserError(
-            f"--scale gps: {len(found)} of {len(photos)} photos have a GPS position in their EXIF data; at least 3 are "
-            f"needed. Give a measured distance, such as {FORM}."
+            f"--scale gps: {len(found)} of {len(photos)} photos have a GPS position in their EXIF data; at least "
+            f"{FEWEST_POSITIONS} are needed. Give a measured distance, such as {FORM}."
         )
     if len(found) < len(photos):
         logger.info("%d of %d photos have a GPS position", len(found), len(photos))

@@ -26,7 +26,7 @@ from freegeo.evidence.matches import find_matches
 from freegeo.export.base import KEPT_NAME
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import Reconstruction, Scale, save_streamed
-from freegeo.files import remove_written, write_json
+from freegeo.files import write_json
 from freegeo.guarded import Evidence
 from freegeo.job import (
     ADAPTATION,
@@ -46,7 +46,7 @@ from freegeo.job import (
     Job,
     write_files,
 )
-from freegeo.metres import Gps, in_metres
+from freegeo.metres import FEWEST_POSITIONS, Gps, scale_to_metres
 from freegeo.pipeline import capital, judge_by_photos
 from freegeo.posed import doubt_focal_length, with_one_camera
 from freegeo.report.page import write_report
@@ -148,22 +148,18 @@ class SequenceJob(Job):
     def _put_in_order(self) -> None:
         """Bring photos that are no sequence into one by what they show; the order is noted down."""
         assert self.photos is not None
-        noted = self._noted("prediction")
-        if "order" not in noted:
+        if "order" not in self._noted("prediction"):
             by_sight = self.plan.order == "similar" or (
                 self.plan.order == "auto"
                 and not all(isinstance(photo, VideoFrame) for photo in self.photos)
                 and not in_order(self.descriptors)
             )
             order = similarity_order(self.descriptors) if by_sight else None
-            self.folder.note("prediction", {**noted, "order": order})
-            if by_sight:
-                # Those that are there are of the order given.
-                remove_written(self.folder / DESCRIPTORS_NAME)
-                vars(self).pop("descriptors")
+            self.folder.note("prediction", {**self._noted("prediction"), "order": order})
         order = self._noted("prediction")["order"]
         if order is None:
             return
+        self.descriptors = self.descriptors[order]
         logger.info("photos are put in an order in which neighbours look alike (--order given keeps theirs)")
         self.order = "similar"
         self.batch = self.batch.select(order)
@@ -176,9 +172,9 @@ class SequenceJob(Job):
     def _chunks(self) -> list[Chunk]:
         """Cut the sequence into chunks, none of which reaches over a place where the photos jump."""
         assert self.photos is not None
-        noted = self._noted("prediction")
-        if "cuts" not in noted:
-            self.folder.note("prediction", {**noted, "cuts": find_cuts(self.descriptors, self.photos)})
+        if "cuts" not in self._noted("prediction"):
+            cuts = find_cuts(self.descriptors, self.photos)
+            self.folder.note("prediction", {**self._noted("prediction"), "cuts": cuts})
         ends = [*self._noted("prediction")["cuts"], len(self.batch)]
         chunks = []
         for start, end in zip([0, *ends[:-1]], ends, strict=True):
@@ -199,7 +195,7 @@ class SequenceJob(Job):
 
     @cached_property
     def descriptors(self) -> np.ndarray:
-        """What each frame shows, (N, C) of unit length."""
+        """What each frame shows, (N, C) of unit length; in the file in the order given."""
         file = self.folder / DESCRIPTORS_NAME
         if file.is_file():
             with np.load(file, allow_pickle=False) as content:
@@ -416,7 +412,7 @@ class SequenceJob(Job):
         return summary
 
     def _write_piece(
-        self, number: int, members: Sequence[Member], frames: Sequence[int], told: dict[str, Any] | None,
+        self, number: int, members: Sequence[Member], frames: Sequence[int], told: dict[str, Any],
         adaptation: Adaptation,
     ) -> dict[str, Any]:  # fmt: skip
         assert self.photos is not None
@@ -432,7 +428,8 @@ class SequenceJob(Job):
                 folder, result, self.formats, filters=self.filters, masks=wanted, photos=photos, seed=self.seed
             )
         found = Computed(result=result, about=about, adaptation=adaptation)
-        summary = self._summary(found, report, failed, photos=photos, sequence=told)
+        # Chunks have the frozen predictions; nobody joined them.
+        summary = self._summary(found, report, failed, photos=photos, sequence=told, frozen_prediction=None)
         write_json(folder / SUMMARY_NAME, summary)
         self.hooks.stage(f"{label}report")
         write_report(folder, photos=photos)
@@ -459,14 +456,36 @@ class SequenceJob(Job):
             known = None if self.known is None else self.known.select(list(frames))
             K, about["one_camera"] = _shared_K(K, batch, photos, known)
         result = save()
-        if self.scale is not None:
-            source = self.scale.select(frames) if isinstance(self.scale, Gps) else self.scale
-            metric = in_metres(result, source, photos)
-            if metric is not result:
-                assert metric.scale is not None
-                T_cam_world, scale = metric.cameras()[0], metric.scale
-                result = save(scale.value)
+        metres = self._metres(folder, result, frames, photos)
+        if metres is not None:
+            T_cam_world, scale = T_cam_world.copy(), metres
+            T_cam_world[:, :3, 3] *= metres.value
+            result = save(metres.value)
         return result, about
+
+    def _metres(
+        self, folder: Path, result: Reconstruction, frames: Sequence[int], photos: Sequence[PhotoLike]
+    ) -> Scale | None:
+        """Return what brings a piece to metres; None, with a warning, where --scale says nothing of its photos."""
+        if self.scale is None:
+            return None
+        if isinstance(self.scale, Gps):
+            source = self.scale.select(frames)
+            known = len(source.views) >= FEWEST_POSITIONS
+        else:
+            source = self.scale.among(result.names)
+            known = len(source.measured) > 0
+        where = f"the piece of {len(frames)} photos between frames {frames[0]} and {frames[-1]}"
+        if not known:
+            self._warn(f"--scale says nothing of {where}: its lengths are {result.lengths}.")
+            return None
+        try:
+            return scale_to_metres(result, source, photos)
+        except UserError as error:
+            if folder == self.folder.path:
+                raise
+            self._warn(f"--scale cannot be used for {where}: {error}")
+            return None
 
     def _about_known(self) -> dict[str, Any] | None:
         """Return what known cameras made of the chunks: sums and medians of what is said of each."""

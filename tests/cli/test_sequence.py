@@ -10,11 +10,17 @@ import pytest
 import torch
 from PIL import Image
 
-from freegeo import job
+from freegeo import job, sequence_job
+from freegeo.adaptation.adapter import is_adapted
+from freegeo.cameras.known import KnownCamera, KnownCameras
+from freegeo.cameras.plain import write
 from freegeo.data.procedural import render, sample_rooms
 from freegeo.errors import FreeGeoError
+from freegeo.export.pixels import corner_K
 from freegeo.export.reconstruction import Reconstruction, open_reconstruction
 from freegeo.geometry.sim3 import Sim3, align_cameras
+from freegeo.sequence.order import descriptors
+from freegeo.sequence_job import SequenceJob
 from freegeo.types import ImageBatch
 
 FRAMES, CHUNK, OVERLAP = 14, 6, 3
@@ -205,7 +211,68 @@ def test_run_adapts_once_for_all_chunks(freegeo, walk, tiny, tmp_path):
     assert all(
         (out / f"chunks/{k:04d}/{name}prediction.npz").is_file() for k in range(COUNT) for name in ("", "frozen/")
     )
-    assert told(out)["adapter"] == "adapter"
+    about = told(out)
+    assert about["adapter"] == "adapter"
+    assert about["frozen_prediction"] is None and not (out / "frozen").exists()
+    windows = COUNT + (COUNT - 1)
+    assert json.loads((out / "adapter/freegeo.json").read_text())["windows"] == [windows]
+
+
+def test_what_follows_an_adapter_that_is_not_used_is_predicted_by_the_frozen_model(
+    freegeo, walk, tiny, tmp_path, monkeypatch
+):
+    def harmed(model, result, *more, **options):
+        result.harm = "Everything is broken."
+
+    adapted = []
+    monkeypatch.setattr(sequence_job, "judge_by_photos", harmed)
+    monkeypatch.setattr(SequenceJob, "_loops", lambda job: (adapted.append(is_adapted(job.model)), ([], []))[1])
+    options = ("--steps", "2", "--sets", "2", "--refine", "off")
+    outcome = freegeo("run", walk, "-o", tmp_path / "out", *tiny, *CHUNKS, *options)
+    assert outcome.code in {0, 3}, outcome.err
+    assert "Everything is broken. The result is that of the frozen model." in outcome.err
+    assert adapted == [False]
+
+
+def test_chunks_with_known_cameras_stay_where_they_are(freegeo, walk, tiny, tmp_path, oracle, truth):
+    cameras = []
+    for given, K in zip(truth.cameras()[0].astype(np.float64), corner_K(truth), strict=True):
+        u, _, vh = np.linalg.svd(given[:3, :3])
+        T = given.copy()
+        T[:3, :3] = u @ vh
+        cameras.append(KnownCamera(T_cam_world=T, K=K, size_hw=(48, 64)))
+    file = tmp_path / "cameras.json"
+    write(KnownCameras(names=truth.names, cameras=tuple(cameras), source="x"), file)
+    options = ("--cameras", file, "--trust-cameras", "--refine", "off")
+    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS, *options)
+    assert outcome.code == 0, outcome.err
+    expected = np.stack([camera.T_cam_world for camera in cameras])
+    np.testing.assert_allclose(open_reconstruction(tmp_path / "out").cameras()[0], expected, atol=1e-12)
+    assert [chunk["piece"] for chunk in told(tmp_path / "out")["sequence"]["chunks"]] == [0] * COUNT
+
+
+def test_a_distance_in_one_piece_leaves_the_others_up_to_scale(freegeo, walk, tiny, tmp_path, oracle):
+    oracle.change = lambda number, result: unlike(result) if number == 2 or number >= COUNT else result
+    distance = "00.png:10,10 01.png:50,40 = 2"
+    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS, "--scale", distance)
+    assert outcome.code == 3, outcome.err
+    about = told(tmp_path / "out")
+    scales = [told(tmp_path / "out" / piece["folder"])["scale"] for piece in about["sequence"]["pieces"]]
+    assert scales[0]["source"] == "a measured distance" and scales[1:] == [None] * (len(scales) - 1)
+    assert len(scales) > 1 and any("--scale says nothing of the piece" in said for said in about["warnings"])
+
+
+def test_photos_in_an_order_of_their_own_are_described_once(freegeo, walk, tiny, tmp_path, oracle, truth, monkeypatch):
+    described = []
+    monkeypatch.setattr(
+        sequence_job, "descriptors", lambda *given: described.append(found := descriptors(*given)) or found
+    )
+    options = ("--order", "similar")
+    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS[:4], *options)
+    assert outcome.code in {0, 3}, outcome.err
+    about = told(tmp_path / "out")
+    assert about["sequence"]["order"] == "similar" and len(described) == 1
+    assert "what each photo shows" in about["seconds"]
 
 
 @pytest.mark.parametrize(

@@ -97,3 +97,9 @@ def test_chunks_of_known_cameras_are_measured_and_not_moved(whole):
     assert all(float(sim3.s) == 1 and torch.equal(sim3.R, torch.eye(3).double()) for sim3 in found.sim3)
     # Along the ray, which is longer than the depth.
     assert all(joint.gap is not None and 0.02 <= joint.gap < 0.024 for joint in found.joints)
+
+
+def test_what_ties_placed_chunks_gives_no_frames(whole):
+    chunks = [*plan_chunks(FRAMES, 6, 2), Chunk(frames=(0, 1, 2, 11, 12, 13), tie="loop")]
+    found, _ = put_together(whole, chunks, placed=True)
+    assert found.pieces == [list(range(len(chunks) - 1))]

@@ -85,6 +85,7 @@ class Joined:
             for row, weight in enumerate(weights(member.chunk, *ends)):
                 self._of.get(member.chunk.frames[row], []).append((number, row, weight))
         self._open = lru_cache(maxsize=_OPEN)(lambda number: self.members[number].load())
+        self._usable = lru_cache(maxsize=_OPEN)(lambda number: self._open(number).valid_pixels())
         self.T_cam_world, self.K = self._cameras()
 
     def blocks(self, name: str, factor: float = 1.0) -> Iterator[np.ndarray] | None:
@@ -124,7 +125,7 @@ class Joined:
         depth = np.stack([self._open(n).depth_z[row] * s for (n, row, _), s in zip(parts, scales, strict=True)])
         if len(parts) == 1:
             return depth[0]
-        usable = np.stack([self._open(number).valid_pixels()[row] for number, row, _ in parts])
+        usable = np.stack([self._usable(number)[row] for number, row, _ in parts])
         weight = np.stack([share * self._open(number).conf[row] for number, row, share in parts])
         weight = np.where(usable, np.maximum(weight, _LEAST_WEIGHT), 0.0)
         best = np.take_along_axis(depth, weight.argmax(0)[None], 0)[0]
