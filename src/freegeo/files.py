@@ -263,9 +263,8 @@ def is_part(path: Path) -> bool:
 def missing(lock: Lock) -> list[Path]:
     """Return the files that the lock's holder wrote and that are gone, or are in no ledger any more."""
     owners = {file: _owner(file) for file in lock.written if file.name not in OWN_FILES}
-    noted = {
-        owner: {owner.resolve() / name for name in ledger(owner)} for owner in owners.values() if owner is not None
-    }
+    folders = {owner for owner in owners.values() if owner is not None}
+    noted = {owner: {owner.resolve() / name for name in ledger(owner)} for owner in folders}
     return sorted(file for file, owner in owners.items() if not file.exists() or file not in noted.get(owner, ()))
 
 
