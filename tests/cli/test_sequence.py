@@ -291,6 +291,13 @@ def test_chunks_that_cannot_be_are_refused(freegeo, walk, tiny, tmp_path, option
     assert not (tmp_path / "out").exists()
 
 
+def test_chunks_that_are_too_small_to_adapt_to_are_refused_at_once(freegeo, walk, tiny, tmp_path, oracle):
+    outcome = freegeo("run", walk, "-o", tmp_path / "out", *tiny, "--chunk", 2)
+    assert outcome.code == 2
+    assert "--chunk 2: adaptation needs chunks of at least 3 photos" in outcome.sentence()
+    assert not oracle.asked
+
+
 def test_joining_in_another_way_predicts_nothing_again(freegeo, walk, tiny, tmp_path, oracle):
     out = tmp_path / "out"
     assert freegeo("reconstruct", walk, "-o", out, *tiny, *CHUNKS).code == 0

@@ -6,12 +6,12 @@ import hashlib
 import logging
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from freegeo.adaptation.recipe import Guard
+from freegeo.adaptation.recipe import SMALLEST_SCENE, Guard
 from freegeo.cli import console
 from freegeo.cli.files import FileOptions, require_complete
 from freegeo.cli.options import (
@@ -36,13 +36,17 @@ from freegeo.progress import step_bar
 from freegeo.run_folder import check_folder, run_folder, stored_state
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from freegeo.adaptation.recipe import Recipe
     from freegeo.cameras.known import KnownCameras
     from freegeo.job import Hooks, Job
     from freegeo.metres import ScaleSource
     from freegeo.models.api import ReconstructionModel
     from freegeo.models.images import Frames
-    from freegeo.types import ImageBatch, PhotoLike
+    from freegeo.models.spec import ModelSpec
+    from freegeo.sequence_job import Plan
+    from freegeo.types import ImageBatch, PhotoLike, Priors
 
 logger = logging.getLogger(__name__)
 
@@ -124,14 +128,10 @@ def run_job(
     filters, masks and formats are written from the predictions that it holds. `after` writes more before the folder
     counts as finished.
     """
-    from freegeo.adaptation.adapt import require_unchanged_images
     from freegeo.cameras.undistortion import UndistortedPhoto
     from freegeo.data.video import VideoFrame
     from freegeo.job import MATCHES_NAME, PARTS, SUMMARY_NAME, Job
-    from freegeo.metres import read_scale
-    from freegeo.models.images import look_at_photos, read_photos
-    from freegeo.pipeline import require_enough_photos, require_reference
-    from freegeo.posed import check_known, is_one_camera, told, undistorted_masks
+    from freegeo.pipeline import require_enough_photos
     from freegeo.sequence_job import SEQUENCE_PARTS, SequenceJob
 
     check_place(output)
@@ -143,86 +143,151 @@ def run_job(
         require_enough_photos(photos)
     if empty.spec.caution:
         logger.warning("%s", empty.spec.caution)
-    masks = files.checked_masks(photos)
-    photos, known = cameras.read(photos)
-    masks = undistorted_masks(masks, photos)
-    pieces = sequence.plan(empty, photos, mixed, model_options.compute())
-    if pieces is None:
-        batch: ImageBatch = read_photos(empty, photos, mixed=mixed)
-    else:
-        _require_joinable(known, plan)
-        frames = look_at_photos(empty, photos, mixed=mixed)
-        shown = _shown(frames)
-        batch, photos = frames.select(shown), [photos[view] for view in shown]
-        known = None if known is None else known.select(shown)
-        masks = None if masks is None else [masks[view] for view in shown]
-    scale = None if placing.scale is None else read_scale(placing.scale, photos)
-    one_camera = is_one_camera(photos) if placing.one_camera is None else placing.one_camera
-    priors, sentence = told(known, batch, empty.spec)
-    if sentence:
-        console.note(sentence)
-    require_reference(model_options.reference, priors)
-    if plan is not None and priors is not None:
-        require_unchanged_images(plan)
-    adaptation: dict[str, Any] = {
-        "photos": list(batch.names), "photo_contents": batch.digest(), **model_options.identity(plan),
-        "recipe": None if plan is None else asdict(plan),
-        "guard": None if plan is None else guard,
-        "adapter": None if adapter is None else adapter_identity(adapter),
-        **({} if priors is None else {"known_cameras": priors.digest()}),
-    }  # fmt: skip
-    # Only where it is not the default, so that folders of earlier versions count as finished.
-    rays = {} if pose_from == "camera" else {"pose_from": pose_from}
-    reference = model_options.reference or empty.spec.reference
-    judged = rays | ({} if reference == empty.spec.reference else {"reference": reference})
-    if plan is not None and guard != "off" and judged:
-        adaptation["judged_by"] = judged
-    if pieces is not None:
-        adaptation["sequence"] = {"chunk": pieces.size, "overlap": pieces.overlap, "order": pieces.order}
-    placed = placing_settings(known, scale, one_camera=one_camera, trusted=cameras.trust_cameras)
+    found = _read_inputs(
+        photos, empty, model_options, plan, mixed=mixed, files=files, cameras=cameras, placing=placing,
+        sequence=sequence,
+    )  # fmt: skip
     settings = {
         "command": command,
         **(extra_settings or {}),
-        "adaptation": adaptation,
-        "prediction": {"reference": reference, **rays},
-        **placed,
+        **_asked_of_model(found, empty.spec, model_options, plan, adapter=adapter, guard=guard, pose_from=pose_from),
+        **placing_settings(found.known, found.scale, one_camera=found.one_camera, trusted=cameras.trust_cameras),
         "refinement": "ba" if refining else "off",
-        **({} if pieces is None else {"joining": {"loops": pieces.loops}}),
-        "filters": files.filter_settings(masks),
+        **({} if found.chunks is None else {"joining": {"loops": found.chunks.loops}}),
+        "filters": files.filter_settings(found.masks),
         "formats": formats,
     }
-    options = {
-        "overwrite": output.overwrite, "parts": PARTS if pieces is None else SEQUENCE_PARTS, "labels": LABELS,
-    }  # fmt: skip
-    unchecked = known is not None and not cameras.trust_cameras
+    unchecked = None if cameras.trust_cameras else found.known
     state = stored_state(output.output)
-    if known is not None and unchecked and state is not None and state["settings"].get("placing") != placed["placing"]:
+    if unchecked is not None and state is not None and state["settings"].get("placing") != settings["placing"]:
         # Before a result that is there gives way to one with cameras that may be refused.
-        console.note("known cameras against matches between the photos ...")
-        check_known(known, photos)
-        unchecked = False
+        _check_cameras(unchecked, found.photos)
+        unchecked = None
+    options = {
+        "overwrite": output.overwrite, "parts": PARTS if found.chunks is None else SEQUENCE_PARTS, "labels": LABELS,
+    }  # fmt: skip
     with run_folder(output.output, settings, **options) as folder, progress_hooks() as hooks:
         if folder.finished:
             say_finished(output.output, folder.finished_at)
             before = read_json(folder / SUMMARY_NAME)
             require_complete(output.output, before.get("not_written", {}), before.get("sequence"))
             return
-        if known is not None and unchecked:
-            console.note("known cameras against matches between the photos ...")
-            check_known(known, photos, folder / MATCHES_NAME)
-        if any(isinstance(photo, VideoFrame | UndistortedPhoto) for photo in photos):
-            write_copies(photos, folder / COPIES_FOLDER)
-        kind = Job if pieces is None else partial(SequenceJob, plan=pieces)
+        if unchecked is not None:
+            _check_cameras(unchecked, found.photos, folder / MATCHES_NAME)
+        if any(isinstance(photo, VideoFrame | UndistortedPhoto) for photo in found.photos):
+            write_copies(found.photos, folder / COPIES_FOLDER)
+        kind = Job if found.chunks is None else partial(SequenceJob, plan=found.chunks)
         job = kind(
-            load=model_options.load, spec=empty.spec, batch=batch, folder=folder, recipe=plan, adapter=adapter,
+            load=model_options.load, spec=empty.spec, folder=folder, recipe=plan, adapter=adapter, guard=guard,
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
-            command=console.command_line(), warnings=console.warned(), after=after, formats=formats, photos=photos,
-            filters=files.filters.settings(), masks=masks, checkpoint=model_options.checkpoint_identity, guard=guard,
-            refine=refining, pose_from=pose_from, known=known, priors=priors, one_camera=one_camera, scale=scale,
+            command=console.command_line(), warnings=console.warned(), after=after, formats=formats,
+            filters=files.filters.settings(), checkpoint=model_options.checkpoint_identity, refine=refining,
+            pose_from=pose_from, photos=found.photos, batch=found.batch, masks=found.masks, known=found.known,
+            priors=found.priors, one_camera=found.one_camera, scale=found.scale,
         )  # fmt: skip
         summary = job.run()
         describe(summary, output.output)
     require_complete(output.output, summary["not_written"], summary.get("sequence"))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Inputs:
+    """The photos of a job, and what is known of them; all parts have the same photos in the same order."""
+
+    photos: Sequence[PhotoLike]
+    batch: ImageBatch
+    chunks: Plan | None
+    """How they are cut into chunks; None: they are predicted at once."""
+    known: KnownCameras | None
+    priors: Priors | None
+    masks: list[np.ndarray] | None
+    scale: ScaleSource | None
+    one_camera: bool
+
+
+def _read_inputs(
+    photos: Sequence[PhotoLike],
+    empty: ReconstructionModel,
+    model_options: ModelOptions,
+    plan: Recipe | None,
+    *,
+    mixed: Mixed,
+    files: FileOptions,
+    cameras: CameraOptions,
+    placing: PlacingOptions,
+    sequence: SequenceOptions,
+) -> _Inputs:
+    """Read photos and what belongs to them; UserError for what does not go together.
+
+    Of a sequence, the photos that show nothing are left out.
+    """
+    from freegeo.adaptation.adapt import require_unchanged_images
+    from freegeo.metres import read_scale
+    from freegeo.models.images import look_at_photos, read_photos
+    from freegeo.pipeline import require_reference
+    from freegeo.posed import is_one_camera, told, undistorted_masks
+
+    masks = files.checked_masks(photos)
+    photos, known = cameras.read(photos)
+    masks = undistorted_masks(masks, photos)
+    chunks = sequence.plan(empty, photos, mixed, model_options.compute())
+    if chunks is None:
+        batch: ImageBatch = read_photos(empty, photos, mixed=mixed)
+    else:
+        _require_joinable(chunks, known, plan)
+        frames = look_at_photos(empty, photos, mixed=mixed)
+        shown = _shown(frames)
+        batch, photos = frames.select(shown), [photos[view] for view in shown]
+        known = None if known is None else known.select(shown)
+        masks = None if masks is None else [masks[view] for view in shown]
+    priors, sentence = told(known, batch, empty.spec)
+    if sentence:
+        console.note(sentence)
+    require_reference(model_options.reference, priors)
+    if plan is not None and priors is not None:
+        require_unchanged_images(plan)
+    return _Inputs(
+        photos=photos, batch=batch, chunks=chunks, known=known, priors=priors, masks=masks,
+        scale=None if placing.scale is None else read_scale(placing.scale, photos),
+        one_camera=is_one_camera(photos) if placing.one_camera is None else placing.one_camera,
+    )  # fmt: skip
+
+
+def _asked_of_model(
+    found: _Inputs,
+    spec: ModelSpec,
+    model_options: ModelOptions,
+    plan: Recipe | None,
+    *,
+    adapter: Path | None,
+    guard: Guard,
+    pose_from: PoseFrom,
+) -> dict[str, Any]:
+    """Return the parts of a job's settings that adapter and predictions depend on."""
+    adaptation: dict[str, Any] = {
+        "photos": list(found.batch.names), "photo_contents": found.batch.digest(), **model_options.identity(plan),
+        "recipe": None if plan is None else asdict(plan),
+        "guard": None if plan is None else guard,
+        "adapter": None if adapter is None else adapter_identity(adapter),
+        **({} if found.priors is None else {"known_cameras": found.priors.digest()}),
+    }  # fmt: skip
+    # Only where it is not the default, so that folders of earlier versions count as finished.
+    rays = {} if pose_from == "camera" else {"pose_from": pose_from}
+    reference = model_options.reference or spec.reference
+    judged = rays | ({} if reference == spec.reference else {"reference": reference})
+    if plan is not None and guard != "off" and judged:
+        adaptation["judged_by"] = judged
+    if (chunks := found.chunks) is not None:
+        adaptation["sequence"] = {"chunk": chunks.size, "overlap": chunks.overlap, "order": chunks.order}
+    return {"adaptation": adaptation, "prediction": {"reference": reference, **rays}}
+
+
+def _check_cameras(known: KnownCameras, photos: Sequence[PhotoLike], store: Path | None = None) -> None:
+    """Raise UserError for known cameras that matches between the photos contradict; `store` keeps the matches."""
+    from freegeo.posed import check_known
+
+    console.note("known cameras against matches between the photos ...")
+    check_known(known, photos, store)
 
 
 def _shown(frames: Frames) -> list[int]:
@@ -239,8 +304,13 @@ def _shown(frames: Frames) -> list[int]:
     return shown
 
 
-def _require_joinable(known: KnownCameras | None, plan: Recipe | None) -> None:
+def _require_joinable(chunks: Plan, known: KnownCameras | None, plan: Recipe | None) -> None:
     """Raise UserError for what photos that are predicted in chunks cannot have."""
+    if plan is not None and chunks.size < SMALLEST_SCENE:
+        raise UserError(
+            f"--chunk {chunks.size}: adaptation needs chunks of at least {SMALLEST_SCENE} photos. Take larger ones, or "
+            "reconstruct without adapting (--no-adapt)."
+        )
     if known is not None and known.has_pose.any() and not known.has_pose.all():
         raise UserError(
             f"{known.source}: of some photos the pose is known and of others not, and these are more photos than are "
