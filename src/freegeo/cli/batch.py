@@ -285,7 +285,7 @@ class _Table:
         console.say(f"\nAll with links: {self.out / INDEX_NAME}")
 
     def require_success(self) -> None:
-        """End with exit code 1 when a scene failed, and with 3 when files of one are missing."""
+        """End with exit code 1 when a scene failed, and with 3 when files or photos of one are missing."""
         shown = [self.rows[work.scene.name] for work in self.works]
         failed = [row.name for row in shown if row.outcome == FAILED]
         if failed:
@@ -294,7 +294,7 @@ class _Table:
             )
         incomplete = [row.name for row in shown if row.outcome == INCOMPLETE]
         if incomplete:
-            raise PartialResultError(f"files of {_some(incomplete)} are missing, everything else is there.")
+            raise PartialResultError(f"results of {_some(incomplete)} are not whole; the table says what is missing.")
 
     @contextmanager
     def _pool(self, device: str | None, *, jobs: int | None, cluster: bool) -> Generator[ProcessPool | RayPool]:

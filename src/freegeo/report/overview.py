@@ -20,7 +20,7 @@ class SceneRow:
 
     name: str
     outcome: str
-    """As `outcome_of` says; or `failed`, `incomplete` (files are missing), `unfinished`."""
+    """As `outcome_of` says; or `failed`, `incomplete` (files or photos are missing), `unfinished`."""
     source: Sequence[str] = ()
     views: int | None = None
     seconds: float | None = None
