@@ -298,6 +298,15 @@ def test_chunks_that_are_too_small_to_adapt_to_are_refused_at_once(freegeo, walk
     assert not oracle.asked
 
 
+def test_auto_keeps_the_chunks_of_an_earlier_run(freegeo, walk, tiny, tmp_path, oracle):
+    """What fits into memory may have changed since."""
+    out, auto = tmp_path / "out", ["--chunk", "auto", "--overlap", OVERLAP, "--order", "given"]
+    assert freegeo("reconstruct", walk, "-o", out, *tiny, *CHUNKS).code == 0
+    assert "already finished" in freegeo("reconstruct", walk, "-o", out, *tiny, *auto).out
+    assert freegeo("reconstruct", walk, "-o", out, *tiny, *auto, "--overwrite").code == 0
+    assert "sequence" not in told(out)
+
+
 def test_joining_in_another_way_predicts_nothing_again(freegeo, walk, tiny, tmp_path, oracle):
     out = tmp_path / "out"
     assert freegeo("reconstruct", walk, "-o", out, *tiny, *CHUNKS).code == 0

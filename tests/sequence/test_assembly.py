@@ -1,5 +1,6 @@
 """Chunks put together: places, pieces, bridges, and what is said of each seam."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -103,3 +104,10 @@ def test_what_ties_placed_chunks_gives_no_frames(whole):
     chunks = [*plan_chunks(FRAMES, 6, 2), Chunk(frames=(0, 1, 2, 11, 12, 13), tie="loop")]
     found, _ = put_together(whole, chunks, placed=True)
     assert found.pieces == [list(range(len(chunks) - 1))]
+
+
+def test_a_seam_of_black_frames_is_told_in_numbers_that_json_has(whole):
+    black = replace(whole, images=np.zeros_like(whole.images))
+    found, _ = put_together(black, plan_chunks(FRAMES, 6, 2))
+    said = [joint.as_dict() for joint in found.joints]
+    assert json.loads(json.dumps(said, allow_nan=False)) == said and {seam["rms"] for seam in said} == {None}

@@ -145,7 +145,7 @@ def run_job(
         logger.warning("%s", empty.spec.caution)
     found = _read_inputs(
         photos, empty, model_options, plan, mixed=mixed, files=files, cameras=cameras, placing=placing,
-        sequence=sequence,
+        sequence=sequence, before=None if output.overwrite else _together_before(output.output),
     )  # fmt: skip
     settings = {
         "command": command,
@@ -216,10 +216,12 @@ def _read_inputs(
     cameras: CameraOptions,
     placing: PlacingOptions,
     sequence: SequenceOptions,
+    before: int | None,
 ) -> _Inputs:
     """Read photos and what belongs to them; UserError for what does not go together.
 
-    Of a sequence, the photos that show nothing are left out.
+    Of a sequence, the photos that show nothing are left out. `before`: how many photos an earlier run of the folder
+    predicted together.
     """
     from freegeo.adaptation.adapt import require_unchanged_images
     from freegeo.metres import read_scale
@@ -230,7 +232,7 @@ def _read_inputs(
     masks = files.checked_masks(photos)
     photos, known = cameras.read(photos)
     masks = undistorted_masks(masks, photos)
-    chunks = sequence.plan(empty, photos, mixed, model_options.compute())
+    chunks = sequence.plan(empty, photos, mixed, model_options.compute(), before=before)
     if chunks is None:
         batch: ImageBatch = read_photos(empty, photos, mixed=mixed)
     else:
@@ -251,6 +253,15 @@ def _read_inputs(
         scale=None if placing.scale is None else read_scale(placing.scale, photos),
         one_camera=is_one_camera(photos) if placing.one_camera is None else placing.one_camera,
     )  # fmt: skip
+
+
+def _together_before(folder: Path) -> int | None:
+    """Return how many photos the run in a folder predicts together; None where there is none."""
+    state = stored_state(folder)
+    adaptation = {} if state is None else state["settings"].get("adaptation") or {}
+    if "sequence" in adaptation:
+        return adaptation["sequence"]["chunk"]
+    return len(adaptation["photos"]) if adaptation.get("photos") else None
 
 
 def _asked_of_model(

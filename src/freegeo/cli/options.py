@@ -326,7 +326,7 @@ class SequenceOptions:
 
     chunk: str = "auto"
     """Photos that are predicted together; of more, chunks are predicted one after the other and joined. auto: as many
-    as fit into memory, at most as many as suit the model."""
+    as fit into memory, at most as many as suit the model; in the folder of an earlier run, as many as there."""
     overlap: int | None = None
     """Photos that two neighbouring chunks share. Default: half of a chunk."""
     loops: bool = True
@@ -335,9 +335,19 @@ class SequenceOptions:
     """Order of the photos: given; similar: by what they show; auto: given, unless neighbours do not look alike."""
 
     def plan(
-        self, model: ReconstructionModel, photos: Sequence[PhotoLike], mixed: Mixed, compute: Compute
+        self,
+        model: ReconstructionModel,
+        photos: Sequence[PhotoLike],
+        mixed: Mixed,
+        compute: Compute,
+        *,
+        before: int | None = None,
     ) -> Plan | None:
-        """Return how photos are cut into chunks; None where all are predicted at once."""
+        """Return how photos are cut into chunks; None where all are predicted at once.
+
+        `before` is the size of a chunk in the run that is continued, which `auto` keeps: what fits into memory may be
+        another number now.
+        """
         from freegeo.adaptation.memory import plan_reconstruction
         from freegeo.models.images import read_some
         from freegeo.sequence.chunks import OVERLAP, plan_chunks
@@ -345,11 +355,11 @@ class SequenceOptions:
 
         count, image_hw = len(photos), read_some(model, photos, [0], mixed).image_hw
         _, fitting = plan_reconstruction(model, 1, image_hw, compute=compute)
-        size = min(fitting, model.spec.chunk) if self.chunk == "auto" else self._size()
+        size = (before or min(fitting, model.spec.chunk)) if self.chunk == "auto" else self._size()
         if min(size, count) > fitting:
             raise UserError(
                 f"--chunk {size}: at most {fitting} photos of {image_hw[1]} x {image_hw[0]} pixels fit into memory "
-                f"together with {model.spec.name}. Take --chunk {fitting}, or auto."
+                f"together with {model.spec.name}. Take --chunk {fitting}."
             )
         overlap = max(1, int(size * OVERLAP)) if self.overlap is None else self.overlap
         chunks = plan_chunks(count, size, overlap)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -38,9 +39,10 @@ class Joint:
     def as_dict(self) -> dict[str, Any]:
         """Return what reconstruction.json says of it."""
         seam = self.seam
+        rms = None if math.isnan(seam.rms) else seam.rms  # JSON has no NaN.
         return {
             "first": self.first, "second": self.second, "frames": seam.frames, "kind": self.kind,
-            "inliers": seam.inliers, "rms": seam.rms, "scale": float(seam.sim3.s), "gap": self.gap,
+            "inliers": seam.inliers, "rms": rms, "scale": float(seam.sim3.s), "gap": self.gap,
             "used": self.reason is None, "reason": self.reason or seam.doubt,
         }  # fmt: skip
 
