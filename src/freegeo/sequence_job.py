@@ -396,11 +396,11 @@ class SequenceJob(Job):
             )
         doubtful = [seam for seam in told["seams"] if seam["used"] and seam["reason"] and seam["kind"] == "neighbours"]
         if doubtful:
-            worst = min(doubtful, key=lambda seam: seam["inliers"])
+            worst = max(doubtful, key=lambda seam: seam["gap"] or 0.0)
             self._warn(
                 f"Neighbouring chunks fit badly at {len(doubtful)} seams, worst of all chunks {worst['first']} and "
-                f"{worst['second']} ({worst['inliers']:.0%} of the shared pixels agree): surfaces may be bent or "
-                "doubled there. Try another --chunk, a larger --overlap or a larger model."
+                f"{worst['second']}: {worst['reason']} Surfaces may be bent or doubled there. Try another --chunk, a "
+                "larger --overlap or a larger model."
             )
         if missing:
             self._warn(f"{missing} of {len(self.batch)} photos are in no chunk that could be predicted.")

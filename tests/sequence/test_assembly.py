@@ -10,6 +10,7 @@ import torch
 from exact_rooms import room
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.geometry.se3 import camera_centres
+from freegeo.geometry.sim3 import Sim3
 from freegeo.sequence.assembly import assemble, broken, seams_between
 from freegeo.sequence.chunks import Chunk, bridge, plan_chunks
 from sequence.test_join import part_of, similarity
@@ -111,3 +112,13 @@ def test_a_seam_of_black_frames_is_told_in_numbers_that_json_has(whole):
     found, _ = put_together(black, plan_chunks(FRAMES, 6, 2))
     said = [joint.as_dict() for joint in found.joints]
     assert json.loads(json.dumps(said, allow_nan=False)) == said and {seam["rms"] for seam in said} == {None}
+
+
+def test_placed_chunks_whose_surfaces_are_apart_are_doubted(whole):
+    chunks = plan_chunks(FRAMES, 6, 2)
+    found, _ = put_together(whole, chunks, placed=True)
+    told = [joint.as_dict() for joint in found.joints]
+    assert all(seam["used"] and "of their depth apart" in seam["reason"] for seam in told)
+    parts = [part_of(whole, chunk, Sim3.identity()) for chunk in chunks]
+    found = assemble(chunks, seams_between(chunks, parts.__getitem__), parts.__getitem__, placed=True)
+    assert all(joint.as_dict()["reason"] is None for joint in found.joints)

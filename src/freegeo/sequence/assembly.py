@@ -10,7 +10,7 @@ from itertools import combinations
 from typing import Any, Literal
 
 from freegeo.geometry.sim3 import Sim3
-from freegeo.sequence.alignment import Depths, Seam, align, gap
+from freegeo.sequence.alignment import INLIER, Depths, Seam, align, gap
 from freegeo.sequence.chunks import Chunk, common_rows
 from freegeo.sequence.graph import Edge, place
 
@@ -36,6 +36,13 @@ class Joint:
     reason: str | None
     """Why it has no part in where the chunks are, in a sentence; None: it has."""
 
+    @property
+    def doubt(self) -> str | None:
+        """What is doubtful where it is used, in a sentence; known cameras and other seams may leave surfaces apart."""
+        if self.seam.doubt is None and self.gap is not None and self.gap > INLIER:
+            return f"as they are placed, the two surfaces are {self.gap:.0%} of their depth apart."
+        return self.seam.doubt
+
     def as_dict(self) -> dict[str, Any]:
         """Return what reconstruction.json says of it."""
         seam = self.seam
@@ -43,7 +50,7 @@ class Joint:
         return {
             "first": self.first, "second": self.second, "frames": seam.frames, "kind": self.kind,
             "inliers": seam.inliers, "rms": rms, "scale": float(seam.sim3.s), "gap": self.gap,
-            "used": self.reason is None, "reason": self.reason or seam.doubt,
+            "used": self.reason is None, "reason": self.reason or self.doubt,
         }  # fmt: skip
 
 
