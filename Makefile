@@ -60,7 +60,7 @@ $(READY): pyproject.toml constraints.txt requirements.lock
 lock:
 	test -x out/uv/bin/python || $(PYTHON) -m venv out/uv
 	out/uv/bin/pip install -q uv==0.13.9
-	out/uv/bin/uv pip compile -q --no-deps --universal --python-version 3.11 --generate-hashes --no-annotate \
+	out/uv/bin/uv pip compile -q -U --no-deps --universal --python-version 3.11 --generate-hashes --no-annotate \
 	    --no-emit-package torch --custom-compile-command 'make lock' constraints.txt -o requirements.lock
 
 licences: $(READY)
