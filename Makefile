@@ -4,7 +4,7 @@ BIN := .venv/bin
 READY := .venv/ready
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test test-slow test-browser test-oracle test-matrix parity lint format clean
+.PHONY: demo test test-slow test-browser test-oracle test-matrix parity lint format lock licences audit clean
 
 demo: $(READY)
 	$(BIN)/freegeo demo --output out/demo
@@ -46,12 +46,30 @@ format: $(READY)
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
-# torch first and pinned: no other package may choose another build of it.
-$(READY): pyproject.toml constraints.txt
+# Everything but torch comes with its hashes. torch is pinned by its version alone, since its builds differ by machine and
+# index; what it needs besides is there by then, but for the libraries of a CUDA build. Nothing is resolved anew.
+$(READY): pyproject.toml constraints.txt requirements.lock
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/pip install -q --no-deps --require-hashes -r requirements.lock
 	$(BIN)/pip install -q -c constraints.txt torch
-	$(BIN)/pip install -q -c constraints.txt -e '.[dev]'
+	$(BIN)/pip install -q --no-deps --no-build-isolation -e .
+	$(BIN)/pip check
 	touch $(READY)
+
+# The hashes of every file that the index has of the versions in constraints.txt, for all platforms.
+lock:
+	test -x out/uv/bin/python || $(PYTHON) -m venv out/uv
+	out/uv/bin/pip install -q uv==0.13.9
+	out/uv/bin/uv pip compile -q -U --no-deps --universal --python-version 3.11 --generate-hashes --no-annotate \
+	    --no-emit-package torch --custom-compile-command 'make lock' constraints.txt -o requirements.lock
+
+licences: $(READY)
+	$(BIN)/python tools/licences.py
+
+# What is installed fits together, and its licences are those of docs/licences.md.
+audit: $(READY)
+	$(BIN)/pip check
+	$(BIN)/python tools/licences.py --check
 
 clean:
 	rm -rf .venv out build .pytest_cache .ruff_cache

@@ -1,40 +1,27 @@
 """Settings of all tests."""
 
-import ipaddress
 import logging
-import sys
 
 import pytest
 import torch
 from hypothesis import settings
+
+import offline
 
 # The same examples in every run: a suite that fails once in a while says nothing about a change.
 settings.register_profile("repeatable", derandomize=True)
 settings.load_profile("repeatable")
 
 
-def is_local(host: object) -> bool:
-    """Whether a host is this machine: no name, localhost or a loopback or wildcard address."""
-    if host in (None, "", b"", "localhost", b"localhost"):
-        return True
-    try:
-        address = ipaddress.ip_address(host.decode() if isinstance(host, bytes) else host)
-    except ValueError:
-        return False
-    return address.is_loopback or address.is_unspecified
+offline.watch(lambda text: pytest.fail(f"a test {text}"))
 
 
-def forbid_network(event: str, arguments: tuple) -> None:
-    """Audit hook: looking a name up, or connecting to another machine, fails the test."""
-    if event in ("socket.getaddrinfo", "socket.gethostbyname", "socket.connect", "socket.sendto"):
-        target = arguments[1] if event in ("socket.connect", "socket.sendto") else arguments
-        # Sockets of the UNIX family have a path in place of an address.
-        if isinstance(target, tuple) and not is_local(target[0]):
-            pytest.fail(f"a test asked the network for {target[0]!r} ({event})")
-
-
-# A hook, not a patched socket module: it also sees what compiled code does through Python, and no test can undo it.
-sys.addaudithook(forbid_network)
+@pytest.fixture(autouse=True)
+def no_network():
+    """Fail a test that asked the network, also where the exception was lost."""
+    offline.asked.clear()
+    yield
+    assert not offline.asked
 
 
 @pytest.fixture(autouse=True)

@@ -1,9 +1,12 @@
 """Downloads: what is in the cache is checked, a damaged file is fetched again, and a failure names its true reason."""
 
+import dataclasses
 import errno
 import hashlib
 import logging
 import os
+import re
+import shutil
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -14,6 +17,7 @@ import torch
 from huggingface_hub import constants
 from safetensors.torch import save
 
+from freegeo.cli import models
 from freegeo.errors import UserError
 from freegeo.models import catalog, hub
 
@@ -194,6 +198,150 @@ def test_a_download_that_is_damaged_on_the_way_is_refused(online):
 def test_weights_that_do_not_load_name_the_repair(online):
     with pytest.raises(UserError, match=r"does not fit da3-base.*`freegeo models download da3-base` checks that file"):
         catalog.load_model("da3-base")
+
+
+# -- the right file: pinned, or the one of the first download
+
+OTHER = save({"model.x": torch.arange(5000.0) + 1})
+
+
+def digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def pin(monkeypatch, **fields) -> None:
+    """Pin da3-base in the catalog."""
+    pinned = dataclasses.replace(catalog.entry("da3-base"), **fields)
+    monkeypatch.setattr(catalog, "entry", lambda name: pinned)
+
+
+def files(cache: Path) -> list[str]:
+    """Return the names of the files that hold weights, whole or in part."""
+    return [path.name for path in cache.rglob("*") if path.is_file() and path.stat().st_size > 1000]
+
+
+def test_a_pinned_revision_is_the_one_that_is_asked_for(online, monkeypatch):
+    pin(monkeypatch, revision=COMMIT, sha256=digest(CONTENT))
+    path = catalog.download("da3-base")
+    assert {line.split("/resolve/")[1] for line in online.asked} == {f"{COMMIT}/model.safetensors"}
+    online.asked.clear()
+    assert catalog.download("da3-base", check_hash=True) == path
+    assert online.asked == []
+
+
+@pytest.mark.parametrize("announced", [True, False])
+def test_a_file_that_is_not_the_pinned_one_is_refused_and_not_kept(online, monkeypatch, cache, announced):
+    pin(monkeypatch, revision=COMMIT, sha256=digest(CONTENT))
+    online.content, online.tag = OTHER, None if announced else "some-tag"
+    for _ in range(2):
+        with pytest.raises(UserError) as error:
+            catalog.download("da3-base")
+        assert "has another file for da3-base than the one that freegeo names" in str(error.value)
+        assert f"(SHA-256 {digest(OTHER)} instead of {digest(CONTENT)}); it was not used." in str(error.value)
+        assert "\n" not in str(error.value)
+        assert files(cache) == []
+    assert any(line.startswith("GET") for line in online.asked) != announced
+
+
+def test_a_file_that_another_program_put_into_the_cache_is_checked_before_its_first_use(online, monkeypatch, cache):
+    path = Path(huggingface_hub.hf_hub_download("depth-anything/DA3-BASE", "model.safetensors"))
+    path.resolve().write_bytes(OTHER)
+    assert catalog.download("da3-base").read_bytes() == CONTENT
+    pin(monkeypatch, sha256=digest(OTHER))
+    with pytest.raises(UserError, match="another file for da3-base than the one that freegeo names"):
+        catalog.download("da3-base")
+
+
+def test_a_download_that_was_refused_is_not_taken_by_the_next_command(online, cache):
+    online.tag = "0" * 64
+    for _ in range(2):
+        with pytest.raises(UserError, match="the download differs from what"):
+            catalog.download("da3-base")
+        assert files(cache) == []
+
+
+@pytest.mark.parametrize("tag", [None, "some-tag"])
+@pytest.mark.parametrize("lost", ["damaged", "removed"])
+def test_the_file_of_the_first_download_counts_from_then_on(online, cache, tag, lost):
+    online.tag = tag
+    path = catalog.download("da3-base")
+    if lost == "damaged":
+        damaged(path, "truncated")
+    else:
+        path.resolve().unlink()
+    online.content = OTHER
+    online.asked.clear()
+    for _ in range(2):
+        with pytest.raises(UserError) as error:
+            catalog.download("da3-base")
+        assert "another file for da3-base than the one that was downloaded first" in str(error.value)
+        assert f"(SHA-256 {digest(OTHER)} instead of {digest(CONTENT)}); it was not used." in str(error.value)
+        folder = cache / "models--depth-anything--DA3-BASE"
+        assert f"If you trust the new one, remove {folder} and run" in str(error.value)
+    assert all(f"/resolve/{COMMIT}/" in line for line in online.asked)
+    shutil.rmtree(folder)
+    assert catalog.download("da3-base").read_bytes() == OTHER
+
+
+def test_a_file_that_changed_since_it_was_checked_is_read_again(online, tmp_path):
+    path = catalog.download("da3-base")
+    damaged(path, "another content")
+    later = path.with_name("model.safetensors.sha256").stat().st_mtime + 10
+    os.utime(path, (later, later))
+    assert catalog.download("da3-base").read_bytes() == CONTENT
+
+
+def test_a_file_known_to_be_damaged_is_not_used_while_the_hub_is_away(online, monkeypatch):
+    path = catalog.download("da3-base")
+    damaged(path, "another content")
+    os.utime(path, (1, 1))
+    use_endpoint(monkeypatch, CLOSED)
+    assert catalog.download("da3-base") == path  # its length is right, and it is no newer than the note
+    for check in (True, False):
+        with pytest.raises(UserError, match=r"is damaged .* could not be downloaded"):
+            catalog.download("da3-base", check_hash=check)
+
+
+def test_the_note_is_what_sha256sum_writes(online):
+    path = catalog.download("da3-base")
+    note = path.with_name("model.safetensors.sha256")
+    assert note.read_text() == f"{digest(CONTENT)}  model.safetensors\n"
+    assert hub.local_file(catalog.entry("da3-base")) == (COMMIT, digest(CONTENT))
+
+
+def test_a_cache_that_takes_no_note_is_read_each_time(online, monkeypatch):
+    path = Path(huggingface_hub.hf_hub_download("depth-anything/DA3-BASE", "model.safetensors"))
+
+    def refuse(self, *arguments):
+        raise PermissionError
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    assert catalog.download("da3-base") == path
+    damaged(path, "another content")
+    online.content = OTHER
+    with pytest.raises(UserError, match="another file for da3-base"):
+        catalog.download("da3-base")
+
+
+def test_describe_prints_what_to_pin(online, capsys):
+    models.describe("da3-base")
+    assert "pinned: nothing; " in capsys.readouterr().out
+    assert online.asked == []
+    catalog.download("da3-base")
+    models.describe("da3-base")
+    assert f"on this machine: revision {COMMIT}, SHA-256 {digest(CONTENT)}" in capsys.readouterr().out
+
+
+def test_the_pins_of_the_catalog_are_whole_and_the_docs_list_them():
+    page = (Path(__file__).parents[2] / "docs" / "reliability.md").read_text("utf-8")
+    for name in catalog.names():
+        item = catalog.entry(name)
+        if item.hub_id is None:
+            continue
+        assert item.revision is None or re.fullmatch("[0-9a-f]{40}", item.revision)
+        assert item.sha256 is None or re.fullmatch("[0-9a-f]{64}", item.sha256)
+        words = [word for word, value in (("revision", item.revision), ("SHA-256", item.sha256)) if value]
+        assert f"| {name} | {' and '.join(words) or 'nothing'} |" in page
 
 
 # -- reasons

@@ -102,6 +102,7 @@ def describe(model: str) -> None:
     console.say(f"parameters: {sum(parameter.numel() for parameter in built.parameters()):,}")
     if item.hub_id:
         console.say(f"download: {_gigabytes(item.download_bytes)}")
+        _say_pins(item)
     needed = _gigabytes(reconstruction_bytes(built))
     memory = f"memory for {VIEWS} photos of 4:3 ({width} x {height}): {needed} to reconstruct"
     if built.cross_view is not None:
@@ -122,6 +123,16 @@ def describe(model: str) -> None:
     console.say(
         console.table(("rank", "trainable parameters"), [(str(r), f"{count_trainable(built, r):,}") for r in RANKS])
     )
+
+
+def _say_pins(item: ModelEntry) -> None:
+    """Say which file of the hub is the right one, and what a file on this machine has."""
+    from freegeo.models.hub import local_file
+
+    pins = [f"{word} {value}" for word, value in (("revision", item.revision), ("SHA-256", item.sha256)) if value]
+    console.say(f"pinned: {', '.join(pins) or 'nothing; the file of the first download counts from then on'}")
+    if found := local_file(item):
+        console.say("on this machine: revision {}, SHA-256 {}".format(*found))
 
 
 @app.command

@@ -27,23 +27,36 @@ _INSTEAD = f"pass --checkpoint FILE, or use the embedded model: --model {EMBEDDE
 def fetch(item: ModelEntry, *, check_hash: bool = False) -> Path:
     """Return the path of a model's checkpoint in the cache of the hub; it is downloaded where it is missing or damaged.
 
-    A file that is there already is checked for its length, with `check_hash` also against its SHA-256, where the cache
-    knows that; a download always is. UserError with the reason when the file cannot be downloaded.
+    A file is used after its SHA-256 was compared with the one of the catalog, or where that names none, with the one
+    of the first download. It is compared again when the file is newer than the note of that, and with `check_hash`;
+    otherwise its length is. UserError with the reason when the file cannot be downloaded or is not the right one.
     """
     import huggingface_hub
 
     assert item.hub_id is not None
-    cached = huggingface_hub.try_to_load_from_cache(item.hub_id, item.hub_file)
-    kept = Path(cached) if isinstance(cached, str) else None
+    kept = _kept(item)
+    revision, expected = item.revision, item.sha256
+    if first := kept or _gone(item):
+        # What was downloaded first counts, not what the hub calls its newest today.
+        revision, expected = revision or _revision(first, item), expected or _known_digest(first)
     if kept is not None:
-        if is_intact(kept, _digest(kept.resolve().name) if check_hash else None):
+        if is_verified(kept, expected, check_hash=check_hash):
             return kept
         logger.info("%s: truncated or damaged; it is downloaded again.", kept)
     try:
-        digest = _digest(_published_etag(huggingface_hub.hf_hub_url(item.hub_id, item.hub_file)))
+        url = huggingface_hub.hf_hub_url(item.hub_id, item.hub_file, revision=revision)
+        announced = _digest(_published_etag(url))
+        if expected is not None and announced not in (None, expected):
+            raise _another_file(item, announced, expected)
         if kept is not None and not kept.is_symlink():
             kept.unlink()  # a cache without links would keep it in the place of the new file
-        path = Path(huggingface_hub.hf_hub_download(item.hub_id, item.hub_file, force_download=kept is not None))
+        path = Path(
+            huggingface_hub.hf_hub_download(
+                item.hub_id, item.hub_file, revision=revision, force_download=kept is not None
+            )
+        )
+    except UserError:
+        raise
     # The client raises errors of several libraries, by its version and the proxy; none of them is ours.
     except Exception as error:
         logger.debug("download of %s failed: %r", item.hub_id, error)
@@ -54,16 +67,50 @@ def fetch(item: ModelEntry, *, check_hash: bool = False) -> Path:
             f"the checkpoint of {item.name} ({item.hub_id}, {size}) {missing} and could not be downloaded: {reason}. "
             f"{remedy} and run `freegeo models download {item.name}`, {_INSTEAD}"
         ) from None
-    if not is_intact(path, digest):
-        raise UserError(
-            f"{path}: the download differs from what {_endpoint()} announced; something on the way damages it. Run "
-            f"`freegeo models download {item.name}` on another network, {_INSTEAD}"
-        )
-    return path
+    if is_verified(path, expected or announced, check_hash=True):
+        return path
+    found = sha256_of(path)
+    path.resolve().unlink()
+    path.unlink(missing_ok=True)
+    if announced is None and expected is not None:
+        raise _another_file(item, found, expected)
+    raise UserError(
+        f"{path}: the download differs from what {_endpoint()} announced; something on the way damages it. Run "
+        f"`freegeo models download {item.name}` on another network, {_INSTEAD}"
+    )
 
 
-def is_intact(path: Path, digest: str | None = None) -> bool:
-    """Whether a checkpoint is as long as it says, and has the given SHA-256."""
+def local_file(item: ModelEntry) -> tuple[str, str] | None:
+    """Return the revision and the SHA-256 of a model's file in the cache of the hub; None without one."""
+    kept = _kept(item)
+    return None if kept is None else (_revision(kept, item), sha256_of(kept))
+
+
+def is_verified(path: Path, expected: str | None, *, check_hash: bool) -> bool:
+    """Whether a checkpoint is as long as it says and has the SHA-256 that is expected, or any where none is known.
+
+    The SHA-256 is kept in a note beside the file; the file is read again when it is newer than the note.
+    """
+    note = _note(path)
+    fresh = note.is_file() and note.stat().st_mtime_ns >= max(1, path.stat().st_mtime_ns)
+    if fresh and not check_hash and _noted_digest(path) == (expected or _noted_digest(path)):
+        return _has_its_length(path)
+    if _has_its_length(path) and (digest := sha256_of(path)) == (expected or digest):
+        _write_note(note, digest, path)
+        return True
+    if note.is_file():
+        os.utime(note, (0, 0))  # it still says what the file should be, and never again that this file was compared
+    return False
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file's content, as `sha256sum` prints it."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _has_its_length(path: Path) -> bool:
+    """Whether a checkpoint is as long as it says."""
     from freegeo.models.checkpoints import read_header
 
     if path.suffix == ".safetensors":
@@ -71,15 +118,75 @@ def is_intact(path: Path, digest: str | None = None) -> bool:
             read_header(path)
         except UserError:
             return False
-    else:
-        with path.open("rb") as file:
-            start = file.read(4)
-        if not start or (start == b"PK\3\4" and not zipfile.is_zipfile(path)):
-            return False
-    if digest is None:
         return True
     with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest() == digest
+        start = file.read(4)
+    return bool(start) and (start != b"PK\3\4" or zipfile.is_zipfile(path))
+
+
+def _kept(item: ModelEntry) -> Path | None:
+    """Return a model's file in the cache of the hub, of the revision that the catalog names."""
+    import huggingface_hub
+
+    assert item.hub_id is not None
+    cached = huggingface_hub.try_to_load_from_cache(item.hub_id, item.hub_file, revision=item.revision)
+    return Path(cached) if isinstance(cached, str) else None
+
+
+def _gone(item: ModelEntry) -> Path | None:
+    """Return where a model's file was that is no longer in the cache, by the newest note that is left."""
+    notes = _folder(item).glob(f"snapshots/{item.revision or '*'}/{item.hub_file}.sha256")
+    newest = max(notes, key=lambda note: note.stat().st_mtime_ns, default=None)
+    return None if newest is None else newest.with_suffix("")
+
+
+def _folder(item: ModelEntry) -> Path:
+    """Return the folder of a model's repository in the cache of the hub."""
+    from huggingface_hub import constants
+
+    return Path(constants.HF_HUB_CACHE, f"models--{(item.hub_id or '').replace('/', '--')}")
+
+
+def _revision(kept: Path, item: ModelEntry) -> str:
+    """Return the commit of a file in the cache: the name of the folder that holds the repository's files."""
+    return kept.parents[len(Path(item.hub_file).parts) - 1].name
+
+
+def _known_digest(kept: Path) -> str | None:
+    """Return the SHA-256 that a file of the cache had when it was downloaded, by the note or the cache's own name."""
+    return _noted_digest(kept) or _digest(kept.resolve().name)
+
+
+def _note(path: Path) -> Path:
+    """Return where the SHA-256 of a file of the cache is kept, in the format of `sha256sum`."""
+    return path.with_name(path.name + ".sha256")
+
+
+def _noted_digest(path: Path) -> str | None:
+    try:
+        return _digest(_note(path).read_text("utf-8").partition(" ")[0])
+    except (OSError, UnicodeError):
+        return None
+
+
+def _write_note(note: Path, digest: str, path: Path) -> None:
+    """Write the note whole; a cache that cannot be written to goes without, and its file is read at each use."""
+    part = note.with_name(f"{note.name}.{os.getpid()}")
+    try:
+        part.write_text(f"{digest}  {path.name}\n", "utf-8")
+        part.replace(note)
+    except OSError as error:
+        logger.debug("%s cannot be written: %s", note, error)
+
+
+def _another_file(item: ModelEntry, found: str, expected: str) -> UserError:
+    """Say that the hub's file is not the pinned one, or not the one that was downloaded first."""
+    first = "freegeo names" if item.sha256 else "was downloaded first"
+    remedy = "Get a newer freegeo" if item.sha256 else f"If you trust the new one, remove {_folder(item)}"
+    return UserError(
+        f"{_endpoint()} has another file for {item.name} than the one that {first} (SHA-256 {found} instead of "
+        f"{expected}); it was not used. {remedy} and run `freegeo models download {item.name}`, {_INSTEAD}"
+    )
 
 
 def _digest(name: str | None) -> str | None:

@@ -104,6 +104,10 @@ class ModelEntry:
     """Rules that translate the checkpoint's names; by default the names are the model's own."""
     hub_id: str | None = None
     hub_file: str = "model.safetensors"
+    revision: str | None = None
+    """Commit of the hub's repository; None: what is newest at the first download."""
+    sha256: str | None = None
+    """SHA-256 of the hub's file, 64 small hexadecimal digits; None: that of the first download counts from then on."""
     gated: bool = False
     """The hub hands the file out only to accounts that accepted its licence."""
     packaged_weights: Path | None = None
