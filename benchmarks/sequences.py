@@ -4,7 +4,7 @@ Run: python benchmarks/sequences.py PART [--frames 300] [--seed 20000000] [--ali
 
 `chunks`: what the embedded model does with chunks of several sizes, each alone: errors of cameras and depth.
 `exact`:  true depth and cameras; each chunk in its own random similarity frame, with noise and outliers. How far the
-          seams and the graph are from the truth.
+          seams and the graph are from the truth, without a loop, with a true one, and with a false one.
 `walk`:   error of the whole trajectory by chunk size, overlap and loops; with --refine, of chunks that are refined by
           matches (docs/refinement.md), with half of a chunk shared.
 `memory`: peak memory of a fresh process against the number of frames, with a figure.
@@ -107,39 +107,64 @@ def trajectory_error(T_cam_world: torch.Tensor, truth: torch.Tensor) -> tuple[fl
 def exact(arguments: argparse.Namespace) -> list[dict]:
     """Align true chunks that were moved, turned, scaled and disturbed."""
     from freegeo.sequence.assembly import assemble, seams_between
-    from freegeo.sequence.chunks import plan_chunks
+    from freegeo.sequence.chunks import Chunk, plan_chunks
 
     around = small(walk(arguments.seed, DOMAIN, arguments.frames))
     scene = around.scene()
-    extent = float((camera_centres(scene.T_cam_world) - camera_centres(scene.T_cam_world).mean(0)).norm(dim=-1).max())
     rows = []
+    size, half = 24, 12
+    last = len(scene) - 1
+    ends = {
+        "none": None,
+        "true": (*range(half), *range(last - half + 1, last + 1)),
+        # Two places that are far apart and are taken for one.
+        "false": (*range(last // 4, last // 4 + half), *range(3 * last // 4, 3 * last // 4 + half)),
+    }
     for noise, outliers in ((0.0, 0.0), (0.01, 0.0), (0.01, 0.1), (0.02, 0.3)):
-        plan = plan_chunks(len(scene), 24, 12)
-        disturbed = [moved_chunk(scene, chunk.frames, noise, outliers, number) for number, chunk in enumerate(plan)]
-        began = time.perf_counter()
-        read = disturbed.__getitem__
-        found = assemble(plan, seams_between(plan, read), read)
-        seconds = time.perf_counter() - began
-        centres, true = [], []
-        for chunk, part, sim3 in zip(plan, disturbed, found.sim3, strict=True):
-            T = torch.from_numpy(part.T_cam_world).double()
-            centres.append(camera_centres(sim3.to(torch.float64).apply_to_cameras(T)))
-            true.append(camera_centres(scene.T_cam_world.double())[list(chunk.frames)])
-        # The first chunk stays, so its own frame is the only freedom; it is found from its own cameras.
-        first = align_cameras(scene.T_cam_world[list(plan[0].frames)].double(),
-                              torch.from_numpy(disturbed[0].T_cam_world).double(), ransac=False).sim3  # fmt: skip
-        off = (first.apply(torch.cat(centres)) - torch.cat(true)).norm(dim=-1)
-        joined = len(found.pieces) == 1
-        rows.append({
-            "noise": noise, "outliers": outliers, "chunks": len(plan), "pieces": len(found.pieces),
-            "rms": float(off.square().mean().sqrt()) / extent if joined else None,
-            "worst": float(off.max()) / extent if joined else None, "seconds": seconds,
-        })  # fmt: skip
+        for loop, frames in ends.items():
+            plan = plan_chunks(len(scene), size, half)
+            parts = [moved_chunk(scene, chunk.frames, noise, outliers, number) for number, chunk in enumerate(plan)]
+            if frames is not None:
+                plan = [*plan, Chunk(frames=frames, tie="loop")]
+                parts.append(moved_chunk(scene, frames, noise, outliers, len(parts), merged=loop == "false"))
+            began = time.perf_counter()
+            found = assemble(plan, seams_between(plan, parts.__getitem__), parts.__getitem__)
+            seconds = time.perf_counter() - began
+            ties = [joint for joint in found.joints if joint.kind == "loop"]
+            rows.append({
+                "noise": noise, "outliers": outliers, "loop": loop, "pieces": len(found.pieces),
+                "loop_used": all(joint.reason is None for joint in ties) if ties else None,
+                **chain_errors(scene, plan, parts, found), "seconds": seconds,
+            })  # fmt: skip
     return rows
 
 
-def moved_chunk(scene, frames: tuple[int, ...], noise: float, outliers: float, seed: int) -> Reconstruction:
-    """The truth of some frames in a random similarity frame, with relative noise and a share of wrong depths."""
+def chain_errors(scene, plan, parts, found) -> dict[str, float | None]:
+    """Errors of the positions of all chunks, relative to the scene's radius; None where they are in pieces."""
+    if len(found.pieces) > 1:
+        return {"rms": None, "worst": None}
+    true = camera_centres(scene.T_cam_world.double())
+    extent = float((true - true.mean(0)).norm(dim=-1).max())
+    # The first chunk stays, so its own frame is the only freedom; it is found from its own cameras.
+    own = align_cameras(
+        scene.T_cam_world[list(plan[0].frames)].double(), torch.from_numpy(parts[0].T_cam_world).double(), ransac=False
+    ).sim3
+    off = []
+    for chunk, part, sim3 in zip(plan, parts, found.sim3, strict=True):
+        if chunk.tie is None:
+            T = sim3.to(torch.float64).apply_to_cameras(torch.from_numpy(part.T_cam_world).double())
+            off.append((own.apply(camera_centres(T)) - true[list(chunk.frames)]).norm(dim=-1))
+    distance = torch.cat(off) / extent
+    return {"rms": float(distance.square().mean().sqrt()), "worst": float(distance.max())}
+
+
+def moved_chunk(
+    scene, frames: tuple[int, ...], noise: float, outliers: float, seed: int, *, merged: bool = False
+) -> Reconstruction:
+    """The truth of some frames in a random similarity frame, with relative noise and a share of wrong depths.
+
+    `merged`: the second half of the frames stands where the first one does, as if both showed one place.
+    """
     rng = np.random.default_rng(seed)
     views = list(frames)
     turn = torch.linalg.qr(torch.from_numpy(rng.normal(size=(3, 3)))).Q
@@ -148,6 +173,10 @@ def moved_chunk(scene, frames: tuple[int, ...], noise: float, outliers: float, s
         R=turn * torch.linalg.det(turn).sign(),
         t=torch.from_numpy(rng.normal(0, 5, size=3)),
     )
+    cameras = scene.T_cam_world[views].double()
+    if merged:
+        half = len(views) // 2
+        cameras[half:] = cameras[half:] @ torch.linalg.inv(cameras[half]) @ cameras[0]
     depth = scene.depth_z[views].double().numpy() * float(sim3.s)
     depth *= 1 + noise * rng.normal(size=depth.shape)
     wrong = rng.random(depth.shape) < outliers
@@ -161,7 +190,7 @@ def moved_chunk(scene, frames: tuple[int, ...], noise: float, outliers: float, s
         photo_hw=np.array([scene.photos[0].size_hw] * count),
         scale_xy=np.ones((count, 2)),
         offset_xy=np.zeros((count, 2)),
-        T_cam_world=sim3.apply_to_cameras(scene.T_cam_world[views].double()).numpy().astype(np.float32),
+        T_cam_world=sim3.apply_to_cameras(cameras).numpy().astype(np.float32),
         K=scene.K[views].numpy().astype(np.float32),
     )
 

@@ -117,11 +117,6 @@ class Seam:
         """How much the seam counts where it meets others."""
         return 1.0 if self.by_cameras else self.inliers
 
-    @property
-    def sure(self) -> bool:
-        """Whether other seams may not overrule it."""
-        return self.by_cameras or self.doubt is None
-
 
 @dataclass(frozen=True, kw_only=True)
 class _Shared:

@@ -125,7 +125,7 @@ def assemble(
         pieces = [[number for number, chunk in enumerate(chunks) if chunk.tie is None]]
         return Assembly(joints=joints, sim3=same, pieces=pieces)
     good = [pair for pair, seam in seams.items() if seam.reason is None]
-    edges = [Edge.of(a, b, seams[a, b], robust=_kind(chunks, a, b) == "loop" or not seams[a, b].sure) for a, b in good]
+    edges = [Edge.of(a, b, seams[a, b], robust=_kind(chunks, a, b) == "loop") for a, b in good]
     found = place(len(chunks), edges, fixed_scale=fixed_scale)
     trust = dict(zip(good, found.trust, strict=True))
     of = {number: k for k, piece in enumerate(found.pieces) for number in piece}
