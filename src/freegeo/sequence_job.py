@@ -202,7 +202,11 @@ class SequenceJob(Job):
                 f"No match leads from the photos before and after to {names}: where the model puts what is there "
                 "cannot be checked. Look whether it belongs to the same scene."
             )
-        still = [run for run in runs(np.flatnonzero(~new_pictures(self.descriptors))) if len(run) >= self.plan.overlap]
+        still = [
+            run
+            for run in runs(np.flatnonzero(~new_pictures(self.descriptors)).tolist())
+            if len(run) >= self.plan.overlap
+        ]
         if still:
             told = [f"{self.photos[run[0] - 1].name} to {self.photos[run[-1]].name}" for run in still]
             self._warn(

@@ -19,6 +19,7 @@ from freegeo.errors import FreeGeoError
 from freegeo.export.pixels import corner_K
 from freegeo.export.reconstruction import Reconstruction, open_reconstruction
 from freegeo.geometry.sim3 import Sim3, align_cameras
+from freegeo.sequence.cuts import Jumps
 from freegeo.sequence.order import descriptors
 from freegeo.sequence_job import SequenceJob
 from freegeo.types import ImageBatch
@@ -314,3 +315,49 @@ def test_joining_in_another_way_predicts_nothing_again(freegeo, walk, tiny, tmp_
     assert freegeo("reconstruct", walk, "-o", out, *tiny, *CHUNKS, "--no-loops").code == 0
     assert len(oracle.asked) == asked
     assert told(out)["settings"]["joining"] == {"loops": False}
+
+
+def test_photos_that_show_nothing_are_refused_when_there_are_no_others(freegeo, tiny, tmp_path):
+    (tmp_path / "dark").mkdir()
+    for k in range(FRAMES):
+        Image.new("RGB", (64, 48)).save(tmp_path / f"dark/{k:02d}.png")
+    outcome = freegeo("reconstruct", tmp_path / "dark", "-o", tmp_path / "out", *tiny, *CHUNKS)
+    assert outcome.code == 2
+    assert "all 14 photos are almost black" in outcome.sentence()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_camera_that_stands_still_is_said(freegeo, walk, tiny, tmp_path, oracle, truth):
+    still = tmp_path / "still"
+    still.mkdir()
+    for k in range(FRAMES):
+        Image.fromarray(truth.images[k if k < 5 else 5]).save(still / f"{k:02d}.png")
+    outcome = freegeo("reconstruct", still, "-o", tmp_path / "out", *tiny, *CHUNKS)
+    assert "The photos 05.png to 13.png are the same picture" in outcome.err
+
+
+def test_a_photo_alone_beyond_a_cut_is_a_piece(freegeo, walk, tiny, tmp_path, oracle, monkeypatch):
+    monkeypatch.setattr(sequence_job, "find_cuts", lambda *_: Jumps(cuts=[FRAMES - 1], doubtful=[]))
+    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS)
+    assert outcome.code == 3, outcome.err
+    assert open_reconstruction(tmp_path / "out/pieces/2").names == ("13.png",)
+
+
+def test_descriptors_belong_to_the_order_also_after_a_stop(freegeo, walk, tiny, tmp_path, oracle, monkeypatch):
+    seen = []
+
+    def cuts(descriptors: np.ndarray, photos: object) -> Jumps:
+        seen.append(descriptors)
+        if len(seen) == 1:
+            raise KeyboardInterrupt
+        return Jumps(cuts=[], doubtful=[])
+
+    order = [*range(0, FRAMES, 2), *range(1, FRAMES, 2)]
+    monkeypatch.setattr(sequence_job, "similarity_order", lambda descriptors: order)
+    monkeypatch.setattr(sequence_job, "find_cuts", cuts)
+    command = ["reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS[:4], "--order", "similar"]
+    assert freegeo(*command).code == 130
+    assert freegeo(*command).code == 0
+    np.testing.assert_array_equal(seen[0], seen[1])
+    with np.load(tmp_path / "out/chunks/descriptors.npz") as content:
+        np.testing.assert_array_equal(content["descriptors"][order], seen[1])
