@@ -1,6 +1,7 @@
 """More photos than are predicted at once: chunks, pieces, a stop in the middle, and what is said of them."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,7 +19,9 @@ from freegeo.data.procedural import render, sample_rooms
 from freegeo.errors import FreeGeoError
 from freegeo.export.pixels import corner_K
 from freegeo.export.reconstruction import Reconstruction, open_reconstruction
+from freegeo.fusion.tracks import Tracks
 from freegeo.geometry.sim3 import Sim3, align_cameras
+from freegeo.refined import Refined
 from freegeo.sequence.cuts import Jumps
 from freegeo.sequence.order import descriptors
 from freegeo.sequence_job import SequenceJob
@@ -361,3 +364,33 @@ def test_descriptors_belong_to_the_order_also_after_a_stop(freegeo, walk, tiny, 
     np.testing.assert_array_equal(seen[0], seen[1])
     with np.load(tmp_path / "out/chunks/descriptors.npz") as content:
         np.testing.assert_array_equal(content["descriptors"][order], seen[1])
+
+
+def test_chunks_that_were_removed_are_refined_again(freegeo, walk, tiny, tmp_path, oracle, monkeypatch):
+    refined = []
+
+    def refine(prediction: Reconstruction, *_: object, **__: object) -> Refined:
+        refined.append(prediction.names)
+        K = prediction.cameras()[1] * np.array([[1.25, 1, 1], [1, 1.25, 1], [1, 1, 1]], np.float32)
+        point = Tracks(
+            xyz=np.zeros((1, 3)), colours=np.zeros((1, 3), np.uint8), point=np.zeros(2, int), view=np.arange(2),
+            pixel=np.zeros((2, 2)),
+        )  # fmt: skip
+        scores = {
+            "epipolar_px": 1.0, "reprojection_px": 1.0, "scale_drift": 0.0, "depth_agreement": 1.0, "matches": 9,
+        }  # fmt: skip
+        about = {
+            "accepted": True, "reason": "It fits.", "lacking": None, "probability": 1.0, "pairs": 1, "told": False,
+            "misfit": None, "frozen": None, "before": scores, "after": scores,
+        }  # fmt: skip
+        return Refined(result=replace(prediction, K=K), tracks=point, about=about)
+
+    monkeypatch.setattr(job, "refine_by_photos", refine)
+    out = tmp_path / "out"
+    command = ["reconstruct", walk, "-o", out, *tiny, *CHUNKS, "--refine", "ba"]
+    assert freegeo(*command).code == 0
+    before = arrays(out)
+    shutil.rmtree(out / "chunks")
+    assert freegeo(*command, "--formats", "tum").code == 0
+    assert len(refined) == 2 * COUNT
+    np.testing.assert_array_equal(before["K"], arrays(out)["K"])
