@@ -12,8 +12,6 @@ from itertools import pairwise, product
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from freegeo.evidence.matches import Outcome, find_matches
 from freegeo.sequence.order import SAME_PICTURE
@@ -72,6 +70,9 @@ def find_cuts(descriptors: np.ndarray, photos: Sequence[PhotoLike]) -> Jumps:
 
 def _looked_at(frame: int, photos: Sequence[PhotoLike]) -> tuple[bool, int | None]:
     """Whether there is a cut before a frame, and which one of it and the frame before no match leads to, if any."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     start, end = max(0, frame - NEAR), min(len(photos), frame + NEAR)
     before, after = range(frame - start), range(frame - start, end - start)
     inner = [pair for side in (before, after) for pair in pairwise(side)]
