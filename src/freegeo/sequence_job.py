@@ -410,10 +410,10 @@ class SequenceJob(Job):
         """Join each piece and write its files; the first one is the result, with what is said of the whole."""
         parts, missing = told["pieces"], len(self.batch) - sum(part["frames"] for part in told["pieces"])
         if len(parts) > 1:
-            others = ", ".join(f"frames {part['first']} to {part['last']} in {part['folder']}" for part in parts[1:])
+            others = some_of([f"{self._span(part)} in {part['folder']}" for part in parts[1:]])
             self._warn(
-                f"The photos fall into {len(parts)} pieces that could not be joined: the result is that of frames "
-                f"{parts[0]['first']} to {parts[0]['last']}, and there are {others}."
+                f"The photos fall into {len(parts)} pieces that could not be joined: the result is that of "
+                f"{self._span(parts[0])}, and there are {others}."
             )
         doubtful = [seam for seam in told["seams"] if seam["used"] and seam["reason"] and seam["kind"] == "neighbours"]
         if doubtful:
@@ -431,6 +431,12 @@ class SequenceJob(Job):
         self.after(self)
         self.folder.finish()
         return summary
+
+    def _span(self, part: Mapping[str, int]) -> str:
+        """Return the frames and photos at the ends of a piece, for people."""
+        assert self.photos is not None
+        first, last = part["first"], part["last"]
+        return f"frames {first} to {last} ({self.photos[first].name} to {self.photos[last].name})"
 
     def _write_piece(
         self, number: int, members: Sequence[Member], frames: Sequence[int], told: dict[str, Any],
