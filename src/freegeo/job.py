@@ -396,7 +396,9 @@ class Job:
     def _is_refined(self, placed: Reconstruction, frozen: Reconstruction | None, *, is_frozen: bool) -> bool:
         """Refine a prediction, unless that is done, and write what comes of it where it is accepted."""
         path, before = self.folder.path, self.folder / UNREFINED_FOLDER
-        if "accepted" not in self._noted("refinement"):
+        noted = self._noted("refinement")
+        # The folder of a chunk may have been removed, and made again but for its refinement.
+        if "accepted" not in noted or (noted["accepted"] and not (path / TRACKS_NAME).is_file()):
             assert self.photos is not None
             with self._timed("refinement", REFINEMENT):
                 found = refine_by_photos(

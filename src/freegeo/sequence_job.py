@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -19,6 +19,7 @@ import numpy as np
 from freegeo import files
 from freegeo.adaptation.adapt import Adapted
 from freegeo.adaptation.views import chunk_windows
+from freegeo.data.photos import some_of
 from freegeo.data.video import VideoFrame
 from freegeo.errors import FreeGeoError, LostFolderError, UserError
 from freegeo.evidence.candidate import Candidate
@@ -52,11 +53,11 @@ from freegeo.posed import doubt_focal_length, with_one_camera
 from freegeo.report.page import write_report
 from freegeo.run_folder import Part
 from freegeo.sequence.assembly import Assembly, Seams, assemble, broken, seams_between
-from freegeo.sequence.chunks import Chunk, bridge, plan_chunks
-from freegeo.sequence.cuts import find_cuts
+from freegeo.sequence.chunks import Chunk, bridge, plan_chunks, runs
+from freegeo.sequence.cuts import Jumps, find_cuts
 from freegeo.sequence.join import Joined, Member
 from freegeo.sequence.loops import Loop, agrees, loop_candidates, loop_frames, verified
-from freegeo.sequence.order import descriptors, in_order, similarity_order
+from freegeo.sequence.order import descriptors, in_order, new_pictures, similarity_order
 
 if TYPE_CHECKING:
     from freegeo.adaptation.adapter import Adapter
@@ -172,26 +173,46 @@ class SequenceJob(Job):
     def _chunks(self) -> list[Chunk]:
         """Cut the sequence into chunks, none of which reaches over a place where the photos jump."""
         assert self.photos is not None
-        if "cuts" not in self._noted("prediction"):
-            cuts = find_cuts(self.descriptors, self.photos)
-            self.folder.note("prediction", {**self._noted("prediction"), "cuts": cuts})
-        ends = [*self._noted("prediction")["cuts"], len(self.batch)]
+        if "jumps" not in self._noted("prediction"):
+            jumps = asdict(find_cuts(self.descriptors, self.photos))
+            self.folder.note("prediction", {**self._noted("prediction"), "jumps": jumps})
+        jumps = Jumps(**self._noted("prediction")["jumps"])
+        ends = [*jumps.cuts, len(self.batch)]
         chunks = []
         for start, end in zip([0, *ends[:-1]], ends, strict=True):
             size = min(self.plan.size, end - start)
-            own = (
-                [Chunk(frames=(start,))]
-                if size < 2
-                else plan_chunks(end - start, size, min(self.plan.overlap, size - 1))
-            )
+            alone = size == 1
+            own = [Chunk(frames=(0,))] if alone else plan_chunks(end - start, size, min(self.plan.overlap, size - 1))
             chunks += [replace(chunk, frames=tuple(start + frame for frame in chunk.frames)) for chunk in own]
-        for start in ends[:-1]:
+        self._doubt_photos(jumps.doubtful)
+        for start in jumps.cuts:
             one, two = (self.photos[i].name for i in (start - 1, start))
             self._warn(
                 f"Nothing that {one} shows is in {two}, nor in the photos around them: the sequence is cut there. "
                 "Photos of what lies between would join both parts."
             )
         return chunks
+
+    def _doubt_photos(self, doubtful: Sequence[int]) -> None:
+        """Name photos that may not belong to the others, and those of a camera that stands still."""
+        assert self.photos is not None
+        if doubtful:
+            names = some_of([self.photos[i].name for i in doubtful])
+            self._warn(
+                f"No match leads from the photos before and after to {names}: where the model puts what is there "
+                "cannot be checked. Look whether it belongs to the same scene."
+            )
+        still = [
+            run
+            for run in runs(np.flatnonzero(~new_pictures(self.descriptors)).tolist())
+            if len(run) >= self.plan.overlap
+        ]
+        if still:
+            told = [f"{self.photos[run[0] - 1].name} to {self.photos[run[-1]].name}" for run in still]
+            self._warn(
+                f"The photos {some_of(told)} are the same picture, so many that chunks may see nothing else: without "
+                "motion, depth and the way to the next photos are a guess. Leave all but a few of them out."
+            )
 
     @cached_property
     def descriptors(self) -> np.ndarray:
@@ -389,10 +410,10 @@ class SequenceJob(Job):
         """Join each piece and write its files; the first one is the result, with what is said of the whole."""
         parts, missing = told["pieces"], len(self.batch) - sum(part["frames"] for part in told["pieces"])
         if len(parts) > 1:
-            others = ", ".join(f"frames {part['first']} to {part['last']} in {part['folder']}" for part in parts[1:])
+            others = some_of([f"{self._span(part)} in {part['folder']}" for part in parts[1:]])
             self._warn(
-                f"The photos fall into {len(parts)} pieces that could not be joined: the result is that of frames "
-                f"{parts[0]['first']} to {parts[0]['last']}, and there are {others}."
+                f"The photos fall into {len(parts)} pieces that could not be joined: the result is that of "
+                f"{self._span(parts[0])}, and there are {others}."
             )
         doubtful = [seam for seam in told["seams"] if seam["used"] and seam["reason"] and seam["kind"] == "neighbours"]
         if doubtful:
@@ -410,6 +431,12 @@ class SequenceJob(Job):
         self.after(self)
         self.folder.finish()
         return summary
+
+    def _span(self, part: Mapping[str, int]) -> str:
+        """Return the frames and photos at the ends of a piece, for people."""
+        assert self.photos is not None
+        first, last = part["first"], part["last"]
+        return f"frames {first} to {last} ({self.photos[first].name} to {self.photos[last].name})"
 
     def _write_piece(
         self, number: int, members: Sequence[Member], frames: Sequence[int], told: dict[str, Any],

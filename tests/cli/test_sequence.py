@@ -1,6 +1,7 @@
 """More photos than are predicted at once: chunks, pieces, a stop in the middle, and what is said of them."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,7 +19,10 @@ from freegeo.data.procedural import render, sample_rooms
 from freegeo.errors import FreeGeoError
 from freegeo.export.pixels import corner_K
 from freegeo.export.reconstruction import Reconstruction, open_reconstruction
+from freegeo.fusion.tracks import Tracks
 from freegeo.geometry.sim3 import Sim3, align_cameras
+from freegeo.refined import Refined
+from freegeo.sequence.cuts import Jumps
 from freegeo.sequence.order import descriptors
 from freegeo.sequence_job import SequenceJob
 from freegeo.types import ImageBatch
@@ -314,3 +318,79 @@ def test_joining_in_another_way_predicts_nothing_again(freegeo, walk, tiny, tmp_
     assert freegeo("reconstruct", walk, "-o", out, *tiny, *CHUNKS, "--no-loops").code == 0
     assert len(oracle.asked) == asked
     assert told(out)["settings"]["joining"] == {"loops": False}
+
+
+def test_photos_that_show_nothing_are_refused_when_there_are_no_others(freegeo, tiny, tmp_path):
+    (tmp_path / "dark").mkdir()
+    for k in range(FRAMES):
+        Image.new("RGB", (64, 48)).save(tmp_path / f"dark/{k:02d}.png")
+    outcome = freegeo("reconstruct", tmp_path / "dark", "-o", tmp_path / "out", *tiny, *CHUNKS)
+    assert outcome.code == 2
+    assert "all 14 photos are almost black" in outcome.sentence()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_camera_that_stands_still_is_said(freegeo, walk, tiny, tmp_path, oracle, truth):
+    still = tmp_path / "still"
+    still.mkdir()
+    for k in range(FRAMES):
+        Image.fromarray(truth.images[k if k < 5 else 5]).save(still / f"{k:02d}.png")
+    outcome = freegeo("reconstruct", still, "-o", tmp_path / "out", *tiny, *CHUNKS)
+    assert "The photos 05.png to 13.png are the same picture" in outcome.err
+
+
+def test_a_photo_alone_beyond_a_cut_is_a_piece(freegeo, walk, tiny, tmp_path, oracle, monkeypatch):
+    monkeypatch.setattr(sequence_job, "find_cuts", lambda *_: Jumps(cuts=[FRAMES - 1], doubtful=[]))
+    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS)
+    assert outcome.code == 3, outcome.err
+    assert open_reconstruction(tmp_path / "out/pieces/2").names == ("13.png",)
+
+
+def test_descriptors_belong_to_the_order_also_after_a_stop(freegeo, walk, tiny, tmp_path, oracle, monkeypatch):
+    seen = []
+
+    def cuts(descriptors: np.ndarray, photos: object) -> Jumps:
+        seen.append(descriptors)
+        if len(seen) == 1:
+            raise KeyboardInterrupt
+        return Jumps(cuts=[], doubtful=[])
+
+    order = [*range(0, FRAMES, 2), *range(1, FRAMES, 2)]
+    monkeypatch.setattr(sequence_job, "similarity_order", lambda descriptors: order)
+    monkeypatch.setattr(sequence_job, "find_cuts", cuts)
+    command = ["reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS[:4], "--order", "similar"]
+    assert freegeo(*command).code == 130
+    assert freegeo(*command).code == 0
+    np.testing.assert_array_equal(seen[0], seen[1])
+    with np.load(tmp_path / "out/chunks/descriptors.npz") as content:
+        np.testing.assert_array_equal(content["descriptors"][order], seen[1])
+
+
+def test_chunks_that_were_removed_are_refined_again(freegeo, walk, tiny, tmp_path, oracle, monkeypatch):
+    refined = []
+
+    def refine(prediction: Reconstruction, *_: object, **__: object) -> Refined:
+        refined.append(prediction.names)
+        K = prediction.cameras()[1] * np.array([[1.25, 1, 1], [1, 1.25, 1], [1, 1, 1]], np.float32)
+        point = Tracks(
+            xyz=np.zeros((1, 3)), colours=np.zeros((1, 3), np.uint8), point=np.zeros(2, int), view=np.arange(2),
+            pixel=np.zeros((2, 2)),
+        )  # fmt: skip
+        scores = {
+            "epipolar_px": 1.0, "reprojection_px": 1.0, "scale_drift": 0.0, "depth_agreement": 1.0, "matches": 9,
+        }  # fmt: skip
+        about = {
+            "accepted": True, "reason": "It fits.", "lacking": None, "probability": 1.0, "pairs": 1, "told": False,
+            "misfit": None, "frozen": None, "before": scores, "after": scores,
+        }  # fmt: skip
+        return Refined(result=replace(prediction, K=K), tracks=point, about=about)
+
+    monkeypatch.setattr(job, "refine_by_photos", refine)
+    out = tmp_path / "out"
+    command = ["reconstruct", walk, "-o", out, *tiny, *CHUNKS, "--refine", "ba"]
+    assert freegeo(*command).code == 0
+    before = arrays(out)
+    shutil.rmtree(out / "chunks")
+    assert freegeo(*command, "--formats", "tum").code == 0
+    assert len(refined) == 2 * COUNT
+    np.testing.assert_array_equal(before["K"], arrays(out)["K"])

@@ -232,3 +232,20 @@ def test_a_trajectory_has_the_times_of_a_video(tmp_path, times, expected):
     ]
     export(scene, tmp_path, ["tum"], photos=photos)
     assert [float(one.name) for one in read_tum(tmp_path / "trajectory.txt").cameras] == list(expected)
+
+
+@pytest.mark.parametrize(
+    ("names", "rows", "expected"),
+    [
+        (("036.png", "007.png", "9.5", "100.jpg"), [1, 2, 0, 3], (7, 9.5, 36, 100)),
+        (("2.png", "02.png", "1.png", "3.png"), [0, 1, 2, 3], range(4)),
+        (("2.png", "b.png", "1.png", "3.png"), [0, 1, 2, 3], range(4)),
+    ],
+)
+def test_a_trajectory_has_the_names_of_photos_that_are_numbers(tmp_path, names, rows, expected):
+    scene = replace(room(), names=names)
+    export(scene, tmp_path, ["tum"])
+    found = read_tum(tmp_path / "trajectory.txt").cameras
+    assert [float(one.name) for one in found] == list(expected)
+    poses = inverse(torch.from_numpy(scene.T_cam_world).double()).numpy()
+    np.testing.assert_allclose(np.stack([one.matrix for one in found]), poses[rows], atol=1e-6)

@@ -5,9 +5,10 @@ import pytest
 
 from freegeo.data.photos import MemoryPhoto
 from freegeo.data.procedural import photograph_room
-from freegeo.sequence.cuts import find_cuts
+from freegeo.sequence.cuts import Jumps, find_cuts
 
 CLIP = 7
+NONE = Jumps(cuts=[], doubtful=[])
 
 
 @pytest.fixture(scope="module")
@@ -28,11 +29,11 @@ def vectors(*jumps: int, count: int = 2 * CLIP) -> np.ndarray:
 
 
 def test_a_jump_between_clips_is_a_cut(clips):
-    assert find_cuts(vectors(CLIP), clips) == [CLIP]
+    assert find_cuts(vectors(CLIP), clips) == Jumps(cuts=[CLIP], doubtful=[])
 
 
 def test_a_jump_within_a_clip_is_none(clips):
-    assert find_cuts(vectors(3, CLIP, 10), clips) == [CLIP]
+    assert find_cuts(vectors(3, CLIP, 10), clips) == Jumps(cuts=[CLIP], doubtful=[])
 
 
 def test_without_a_jump_nothing_is_matched(clips):
@@ -40,14 +41,32 @@ def test_without_a_jump_nothing_is_matched(clips):
         def read(self):
             raise AssertionError
 
-    assert find_cuts(vectors(), [Unread(photo.name, photo.pixels) for photo in clips]) == []
+    assert find_cuts(vectors(), [Unread(photo.name, photo.pixels) for photo in clips]) == NONE
 
 
-def test_where_neighbours_do_not_match_either_nothing_is_said(clips):
+def test_where_neighbours_do_not_match_either_it_is_no_cut_but_doubtful(clips):
     dark = [*clips[:CLIP], *(MemoryPhoto(photo.name, photo.pixels // 64) for photo in clips[CLIP:])]
-    assert find_cuts(vectors(CLIP), dark) == []
+    assert find_cuts(vectors(CLIP), dark) == Jumps(cuts=[], doubtful=[CLIP])
+
+
+def test_a_photo_of_another_place_is_doubtful(clips):
+    mixed = [*clips[:3], clips[CLIP], *clips[3:CLIP]]
+    assert find_cuts(vectors(3, 4, count=CLIP + 1), mixed) == Jumps(cuts=[], doubtful=[3])
+
+
+def test_a_last_photo_of_another_place_is_cut_off(clips):
+    assert find_cuts(vectors(CLIP, count=CLIP + 1), clips[: CLIP + 1]) == Jumps(cuts=[CLIP], doubtful=[])
+
+
+def test_a_camera_that_stands_still_does_not_make_jumps_of_its_steps(clips):
+    class Unread(MemoryPhoto):
+        def read(self):
+            raise AssertionError
+
+    still = vectors(count=CLIP)[[0, 1, 2, *[3] * 7, 4, 5, 6]]
+    assert find_cuts(still, [Unread("", clips[0].pixels)] * len(still)) == NONE
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_few_photos_are_never_cut(clips, count):
-    assert find_cuts(vectors(count=count), clips[:count]) == []
+    assert find_cuts(vectors(count=count), clips[:count]) == NONE

@@ -13,6 +13,7 @@ from freegeo.cameras.convention import matrix_of
 from freegeo.cameras.known import KnownCameras
 from freegeo.data.photos import natural_key
 from freegeo.errors import UserError
+from freegeo.export.tum import times_of_names
 from freegeo.geometry.rotation import matrix_to_quat_xyzw, quat_xyzw_to_matrix
 
 READING = "c2w-opencv"
@@ -72,27 +73,11 @@ def write_tum(known: KnownCameras, path: Path) -> None:
     """Write poses; times are the photos' names where all are different numbers, else 0, 1, 2, ..."""
     matrices = _matrices(known, "a TUM trajectory")
     lines = []
-    for time, matrix in zip(_times(known), matrices, strict=True):
+    for time, matrix in zip(times_of_names(known.names), matrices, strict=True):
         quat = matrix_to_quat_xyzw(torch.from_numpy(matrix[:3, :3].copy())).tolist()
         lines.append(" ".join(repr(float(value)) for value in [time, *matrix[:3, 3], *quat]) + "\n")
     with files.atomic_path(path) as part:
         part.write_text("# time tx ty tz qx qy qz qw (camera to world)\n" + "".join(lines), encoding="utf-8")
-
-
-def _times(known: KnownCameras) -> list[float]:
-    try:
-        times = [float(Path(name).name if _is_number(Path(name).name) else Path(name).stem) for name in known.names]
-    except ValueError:
-        return [float(k) for k in range(len(known))]
-    return times if len(set(times)) == len(times) else [float(k) for k in range(len(known))]
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def find_kitti(path: Path) -> Path | None:

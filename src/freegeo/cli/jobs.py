@@ -306,6 +306,8 @@ def _shown(frames: Frames) -> list[int]:
     from freegeo.data.photos import some_of
 
     shown = frames.shown()
+    if not shown:
+        raise UserError(f"all {len(frames)} photos are almost black, white or of one colour. Give photos of a scene.")
     blank = [name for view, name in enumerate(frames.names) if view not in set(shown)]
     if blank:
         logger.warning(

@@ -1,11 +1,13 @@
 """``trajectory.txt``: the cameras as a TUM trajectory, camera to world with OpenCV axes.
 
-A row a view: `timestamp tx ty tz qx qy qz qw`. The timestamp is the time of a video's frame in seconds, where all views
-have different ones and the frames are at hand; otherwise it is the number of the view, from 0.
+A row a view: `timestamp tx ty tz qx qy qz qw`, in the order of the timestamps. The timestamp is the time of a video's
+frame in seconds, where all views have different ones and the frames are at hand; otherwise the name of the photo, where
+all names are different numbers, by which readers of such files find the photo; otherwise the number of the view.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +25,7 @@ def write_tum(reconstruction: Reconstruction, path: Path, *, times: list[float] 
     Args:
         reconstruction: with cameras.
         path: of the file.
-        times: of the views, in seconds; None: their numbers.
+        times: of the views, in seconds; None: their names where those are numbers, else the numbers of the views.
     """
     import torch
 
@@ -32,12 +34,31 @@ def write_tum(reconstruction: Reconstruction, path: Path, *, times: list[float] 
     poses = np.linalg.inv(reconstruction.cameras()[0].astype(np.float64))
     quats = matrix_to_quat_xyzw(torch.from_numpy(poses[:, :3, :3].copy())).numpy()
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    values = np.column_stack((np.arange(len(poses)) if times is None else times, poses[:, :3, 3], quats))
+    if times is None:
+        times = times_of_names(reconstruction.names)
+    values = np.column_stack((times, poses[:, :3, 3], quats))[np.argsort(times, kind="stable")]
     about = f"# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes); lengths are {reconstruction.lengths}\n"
     rows = [" ".join(repr(value) for value in row) + "\n" for row in values.tolist()]
     with files.atomic_path(path) as part:
         part.write_text(about + "".join(rows), encoding="utf-8")
     return path
+
+
+def times_of_names(names: Sequence[str]) -> list[float]:
+    """Return the photos' names, with or without ending, where all are different numbers, else 0, 1, 2, ..."""
+    by_number = [float(k) for k in range(len(names))]
+    try:
+        times = [_number(Path(name)) for name in names]
+    except ValueError:
+        return by_number
+    return times if len(set(times)) == len(times) and np.isfinite(times).all() else by_number
+
+
+def _number(name: Path) -> float:
+    try:
+        return float(name.name)
+    except ValueError:
+        return float(name.stem)
 
 
 def _times(export: Export) -> list[float] | None:

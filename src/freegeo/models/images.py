@@ -94,8 +94,8 @@ class Frames(ImageBatch):
     mixed: Mixed
 
     def shown(self) -> list[int]:
-        """Return the views that show something; all where none does."""
-        return [view for view, photo in enumerate(self.chosen) if photo not in self.blank] or list(range(len(self)))
+        """Return the views that show something."""
+        return [view for view, photo in enumerate(self.chosen) if photo not in self.blank]
 
     def select(self, views: Sequence[int]) -> Frames:
         """Return the chosen views, in the order given, not read yet."""

@@ -15,6 +15,7 @@ import numpy as np
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.matches import Matches, MatchSettings, find_matches
 from freegeo.evidence.scores import epipolar
+from freegeo.sequence.order import SAME_PICTURE, new_pictures
 
 if TYPE_CHECKING:
     from freegeo.types import PhotoLike
@@ -25,8 +26,6 @@ logger = logging.getLogger(__name__)
 
 MUTUAL = 3
 """Each frame of a candidate is among so many far frames that are most like the other."""
-SAME_PICTURE = 1e-5
-"""Two frames whose similarity is nearer to 1 than this are one picture (a frozen camera, black frames)."""
 FEWEST_PAIRS = 2
 """Each of the two frames must have verified matches with so many of the three around the other one."""
 LEAST_SHARE = 0.8
@@ -84,7 +83,7 @@ def loop_candidates(descriptors: np.ndarray, *, apart: int, most: int | None = N
     if apart < 6:
         raise ValueError(f"the ends of a loop must be at least 6 frames apart; apart is {apart}")
     count, step = len(descriptors), max(1, apart // 6)
-    new = np.flatnonzero(_new(descriptors))
+    new = np.flatnonzero(new_pictures(descriptors))
     if count <= apart or len(new) <= step:
         return []
     least = float(np.median(_alike(descriptors, new[:-step], new[step:])))
@@ -171,13 +170,6 @@ def agrees(candidate: Candidate, frames: Sequence[int], loop: Loop, matches: Mat
 def _alike(descriptors: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Similarity (n,) of pairs of frames."""
     return np.einsum("nc,nc->n", descriptors[first], descriptors[second])
-
-
-def _new(descriptors: np.ndarray) -> np.ndarray:
-    """Which frames (N,) show another picture than the frame before."""
-    frames = np.arange(1, len(descriptors))
-    repeated = _alike(descriptors, frames - 1, frames) > 1 - SAME_PICTURE
-    return np.concatenate((np.ones(min(1, len(descriptors)), dtype=bool), ~repeated))
 
 
 def _mutual(descriptors: np.ndarray, frames: np.ndarray, apart: int) -> tuple[np.ndarray, np.ndarray]:

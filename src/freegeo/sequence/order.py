@@ -14,7 +14,7 @@ from torch import Tensor
 from freegeo.models.api import ReconstructionModel, views_per_chunk
 from freegeo.models.precision import Compute
 
-__all__ = ["descriptors", "in_order", "similarity_order"]
+__all__ = ["SAME_PICTURE", "descriptors", "in_order", "new_pictures", "similarity_order"]
 
 FREQUENCIES = 512
 """Random frequencies; a descriptor has a sine and a cosine of each."""
@@ -23,6 +23,8 @@ SHARPNESS = (2.0, 10.0)
 kernels of several widths are mixed."""
 LEAST_ORDER = 0.5
 """Share of the similarity order's gain over a random order that a given order must have to be kept."""
+SAME_PICTURE = 1e-5
+"""Two frames whose similarity is nearer to 1 than this are one picture (a frozen camera, black frames)."""
 _PARTNERS = 32
 """So many frames that are most like a frame may become its neighbours at first."""
 _SMALLEST_GAIN = 1e-5
@@ -54,6 +56,12 @@ def descriptors(model: ReconstructionModel, images_in_parts: Iterable[Tensor], c
             patches = tokens.tokens[0, :, -tokens.grid_hw[0] * tokens.grid_hw[1] :]
             found.append(_described(patches.float()).cpu().numpy())
     return np.concatenate(found) if found else np.zeros((0, 2 * FREQUENCIES), np.float32)
+
+
+def new_pictures(descriptors: np.ndarray) -> np.ndarray:
+    """Return which frames (N,) show another picture than the frame before."""
+    repeated = (descriptors[:-1] * descriptors[1:]).sum(axis=1) > 1 - SAME_PICTURE
+    return np.concatenate((np.ones(min(1, len(descriptors)), dtype=bool), ~repeated))
 
 
 def similarity_order(descriptors: np.ndarray) -> list[int]:
