@@ -2,7 +2,7 @@
 
 A command's output folder goes through three states: absent, unfinished (its settings are stored, its files appear one
 by one) and finished (the marker names when). Settings may be ordered in parts: when a part changes, the files that
-depend on it or on a later part go, and the others stay. Only the standard library is used here.
+depend on it or on a later part go, and the others stay.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Required, TypedDict
 
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import UserError
 from freegeo.files import (
     FORMAT,
     LEDGER_FILE,
@@ -36,6 +36,15 @@ from freegeo.files import (
 from freegeo.lock import Lock, locked, lost
 
 _SHOWN = 4
+
+
+class _State(TypedDict, total=False):
+    """Content of `RUN_FILE`."""
+
+    format: Required[int]
+    settings: Required[dict[str, Any]]
+    finished: Required[str | None]
+    notes: dict[str, dict[str, Any] | None] | None
 
 
 @dataclass(frozen=True)
@@ -234,10 +243,7 @@ def stored_state(path: Path) -> dict[str, Any] | None:
     file = path / RUN_FILE
     if not file.is_file():
         return None
-    state = read_json(file)
-    if not isinstance(state, dict) or not {"format", "settings", "finished"} <= set(state):
-        raise FreeGeoError(f"{file}: not the state of a run. Choose another output folder.")
-    return state
+    return read_json(file, _State, advice="Choose another output folder.")
 
 
 def clear(path: Path, *, keep: Callable[[str], bool] = lambda name: False) -> None:
