@@ -202,6 +202,13 @@ def fitted(name: str) -> str:
     return path.with_name(stem + ending).as_posix()
 
 
+def require_writable(folder: Path) -> None:
+    """Raise UserError when files cannot be made in a folder, or the folder itself cannot: a check before long work."""
+    existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        raise UserError(f"{folder}: the output folder cannot be written to. Choose another one.")
+
+
 def keep_ledger(folder: Path) -> None:
     """Make a folder that notes down what is written below it; a part of an output folder does so already."""
     if _owner(folder / LEDGER_FILE) is None:

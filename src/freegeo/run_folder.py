@@ -8,7 +8,6 @@ depend on it or on a later part go, and the others stay.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -29,6 +28,7 @@ from freegeo.files import (
     read_json,
     remove_listed,
     remove_parts,
+    require_writable,
     start_ledger,
     write_json,
     write_ledger,
@@ -44,7 +44,7 @@ class _State(TypedDict, total=False):
     format: Required[int]
     settings: Required[dict[str, Any]]
     finished: Required[str | None]
-    notes: dict[str, dict[str, Any] | None] | None
+    notes: dict[str, Any] | None
 
 
 @dataclass(frozen=True)
@@ -219,7 +219,7 @@ def check_folder(
     if before is None:
         if path.is_dir() and any(p.name not in OWN_FILES and not _is_left_over(p) for p in path.iterdir()):
             raise UserError(f"{path}: holds files that freegeo did not write. Choose an empty or a new folder.")
-        _require_writable(path)
+        require_writable(path)
         return
     if before["format"] > FORMAT:
         raise UserError(f"{path}: written by a newer freegeo (format {before['format']}). Update freegeo.")
@@ -230,7 +230,7 @@ def check_folder(
             f"{path}: holds {state} with other options ({difference(before['settings'], settings, labels)}). "
             "Add --overwrite to replace it, or choose another folder."
         )
-    _require_writable(path)
+    require_writable(path)
 
 
 def _is_left_over(path: Path) -> bool:
@@ -275,12 +275,6 @@ def difference(before: Mapping[str, Any], now: Mapping[str, Any], labels: Mappin
 
 def _state(settings: Mapping[str, Any], finished: str | None, notes: Mapping[str, Any]) -> dict[str, Any]:
     return {"format": FORMAT, "settings": settings, "finished": finished, "notes": notes}
-
-
-def _require_writable(path: Path) -> None:
-    existing = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
-    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
-        raise UserError(f"{path}: the output folder cannot be written to. Choose another one.")
 
 
 def _differences(

@@ -1,6 +1,7 @@
 """Damage every kind of file that freegeo reads, in this process, and report what is neither a result nor a sentence.
 
-`python fuzz.py [CASES] [SEED] [READER ...]` prints a table; `test_fuzz.py` runs a small part of it. Each case is one
+`python -m torture.fuzz [CASES] [SEED] [READER ...]`, in the folder of the tests, prints a table; `test_fuzz.py` runs a
+small part of it. Each case is one
 reader and one mutation, both decided by the seed and the number of the case.
 """
 
@@ -29,20 +30,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from readers import READERS, Reader
 
 from freegeo.errors import FreeGeoError
+from torture.readers import READERS, Reader
 
 LIMIT_S = 20.0
 """Longest that a case may take."""
 MORE_MEMORY = 1 << 30
 """Bytes of address space beyond those of the start that a case may take."""
 ODD = (
-    None, True, 0, -1, 1, 2**31, 2**63, 10**400, 1.5, float("nan"), float("inf"), "", "x", "..", "/etc/passwd", "\0", [],
-    {}, [[]], [None], {"a": 1}, "1" * 5000, ["x"] * 3, -1e308, "1e999",
+    None, True, 0, -1, 1, 2**31, 2**63, 10**400, 1.5, float("nan"), float("inf"), "", "x", "..", "/etc/passwd", "\0",
+    [], {}, [[]], [None], {"a": 1}, "1" * 5000, ["x"] * 3, -1e308, "1e999",
 )  # fmt: skip
 DTYPES = ("?", "i1", "u1", "<i8", "<f2", "<f4", ">f8", "<c8", "<U3", "S2", "O", "<M8[s]", "V3", "<u8")
 SHAPES = ((), (0,), (1,), (3,), (2, 0), (1, 1), (2, 3), (1, 4, 4), (3, 3, 3), (2, 2, 2, 2), (0, 0, 0))
+
+
+class TooSlow(BaseException):
+    """A case that takes too long; nothing that is tested may catch it."""
 
 
 @dataclass
@@ -273,7 +278,7 @@ def limits() -> Iterator[None]:
     """Refuse memory far beyond that of the start, and interrupt what takes too long."""
 
     def late(*_: object) -> None:
-        raise TimeoutError(f"longer than {LIMIT_S} s")
+        raise TooSlow(f"longer than {LIMIT_S} s")
 
     before, handler = resource.getrlimit(resource.RLIMIT_AS), signal.signal(signal.SIGALRM, late)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -300,7 +305,7 @@ def case(reader: Reader, original: Path, victim: Path, rng: random.Random, outco
         fault = sentence_fault(error)
         if fault:
             outcome.faults[fault] += 1
-    except Exception as error:
+    except (Exception, TooSlow) as error:
         outcome.faults[described(error)] += 1
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)

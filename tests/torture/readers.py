@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import torch
@@ -46,6 +47,7 @@ from freegeo.run_folder import run_folder
 from tiny_models import tiny_da3, trained
 
 VIEWS, SIZE = 3, (12, 16)
+HIROOM = "20241230/828805/cam_sampled_06"
 DATASETS = fixture_path("benchmark", "datasets")
 
 
@@ -136,14 +138,13 @@ def _report(file: Path) -> None:
 
 def _bench(name: str) -> Callable[[Path], Path]:
     def write(folder: Path) -> Path:
-        splits.photograph_room = lambda seed, domain, frames: small_room(seed, domain, frames)
         one = task()
-        store_truth(folder / "data", folder / "out", one)
+        with mock.patch.object(splits, "photograph_room", small_room):
+            store_truth(folder / "data", folder / "out", one)
         files.write_json(one.folder(folder / "out") / "scores.json", {"metrics": {"auc30": 0.5}, "failed": {}})
         evaluate_all(folder / "data", folder / "out")
         places = {
-            "task.json": one.folder(folder / "out") / "task.json", "scores.json": one.folder(folder / "out") / "scores.json",
-            "prediction.npz": one.folder(folder / "out") / "prediction.npz",
+            **{file: one.folder(folder / "out") / file for file in ("task.json", "scores.json", "prediction.npz")},
             "results.jsonl": next((folder / "out").glob("*.jsonl")),
             "room.npz": next((folder / "data").rglob(f"{ROOMS[0]}.npz")),
         }  # fmt: skip
@@ -378,6 +379,7 @@ READERS = (
     _dataset("eth3d", "delivery_area", "delivery_area/combined_mesh.ply"),
     _dataset("7scenes", "stairs", "7Scenes/stairs/seq-02/frame-000000.pose.txt"),
     _dataset("7scenes", "stairs", "7Scenes/stairs/seq-02/frame-000000.depth.png"),
+    _dataset("hiroom", HIROOM, f"data/{HIROOM}/pose/0001.npy"),
     _dataset("scannetpp", "1ada7a0617", "1ada7a0617/merge_dslr_iphone/colmap/sparse_render_rgb/cameras.bin"),
     _dataset("scannetpp", "1ada7a0617", "1ada7a0617/merge_dslr_iphone/colmap/sparse_render_rgb/images.bin"),
     _dataset("scannetpp", "1ada7a0617", "1ada7a0617/merge_dslr_iphone/render_depth/frame_000000.png"),

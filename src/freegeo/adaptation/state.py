@@ -92,6 +92,8 @@ def _misfit(named: Mapping[str, torch.Tensor], tensors: Mapping[str, torch.Tenso
     """Name the first tensor that is missing, or not one of the adapter or its optimiser; None where all fit."""
     shares = {key.removeprefix(_EARLIER).partition("|")[0] for key in tensors if key.startswith(_EARLIER)}
     wanted = [*named, *(f"{_EARLIER}{share}|{name}" for share in shares for name in named)]
+    moments = {key.partition("|")[2] for key in tensors if key.partition("|")[0] in named} - {""}
+    wanted += [f"{name}|{key}" for name in named for key in sorted(moments) if _has_moments(name, tensors)]
     for name in wanted:
         if name not in tensors:
             return f"{name} is missing"
@@ -108,6 +110,10 @@ def _misfit(named: Mapping[str, torch.Tensor], tensors: Mapping[str, torch.Tenso
         if not value.is_floating_point() or not value.isfinite().all():
             return f"{key} holds values that are not finite numbers"
     return None
+
+
+def _has_moments(name: str, tensors: Mapping[str, torch.Tensor]) -> bool:
+    return any(key.startswith(f"{name}|") for key in tensors)
 
 
 def _is_share(text: str) -> bool:

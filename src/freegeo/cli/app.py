@@ -147,18 +147,18 @@ def run_command(arguments: Sequence[str]) -> int:
 def out_of_memory(error: BaseException) -> str | None:
     """Return what to do about an error of exhausted memory, of this machine or of a device; None for other errors."""
     text = " ".join(str(error).split())
+    again = "The same command continues an unfinished run."
     of_device = type(error).__name__ in ("OutOfMemoryError", "AcceleratorError") and "out of memory" in text
-    of_device = of_device or "MPS backend out of memory" in text
-    if of_device:
-        advice = (
-            "fewer --views, smaller images, --precision bf16 or a smaller --model; or free the device of other work"
+    if of_device or "MPS backend out of memory" in text:
+        return (
+            "the memory of the device does not suffice. Use fewer photos (--max-views, --views), smaller images, "
+            f"--precision bf16 or a smaller --model, or free the device of other work. {again}"
         )
-        return f"the memory of the device does not suffice. Use {advice}. The same command continues an unfinished run."
     # PyTorch's allocator of main memory raises a plain RuntimeError.
     if isinstance(error, MemoryError) or "can't allocate memory" in text or "not enough memory" in text:
-        advice = "fewer photos (--max-views), smaller images or a smaller --model; or close other programs"
         return (
-            f"the memory of this machine does not suffice. Use {advice}. The same command continues an unfinished run."
+            "the memory of this machine does not suffice. Use fewer photos (--max-views), smaller images or a smaller "
+            f"--model, or close other programs. {again}"
         )
     return None
 

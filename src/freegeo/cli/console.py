@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
-STANDARD_OUTPUT = "what this command prints"
+STANDARD_OUTPUT = "standard output"
 _typed: list[str] = []
 _warned: list[str] = []
 

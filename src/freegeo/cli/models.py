@@ -212,6 +212,7 @@ def score(
     from freegeo.cli.options import use_few_threads
     from freegeo.data.procedural import get_domain
     from freegeo.errors import UserError
+    from freegeo.files import require_writable
     from freegeo.training.camera_card import CAMERA_DOMAINS, camera_card, camera_tables
     from freegeo.training.report_card import REPORTED_DOMAINS, card_tables, gate_lines, report_card
     from freegeo.training.state import trained_model
@@ -220,6 +221,7 @@ def score(
     names = reported if domains is None else tuple(name.strip() for name in domains.split(","))
     if rooms < 1:
         raise UserError(f"--rooms must be at least 1, got {rooms}.")
+    require_writable(output.parent)
     for name in names:
         get_domain(name).seeds(rooms)
     if checkpoint and catalog.entry(model).name == catalog.EMBEDDED_MODEL:

@@ -104,7 +104,7 @@ def _require_numbers(app: App, commands: tuple[str, ...], arguments: ArgumentCol
 def _wrong_whole(text: str) -> str | None:
     if not _WHOLE.fullmatch(text):
         return "not a whole number"
-    fits = len(text) <= _DIGITS and -(2**63) <= int(text) < 2**63
+    fits = len(text) <= _DIGITS and -(2**63) <= int(text) < 2**64
     return None if fits else "too large a number"
 
 
