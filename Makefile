@@ -4,7 +4,7 @@ BIN := .venv/bin
 READY := .venv/ready
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test test-slow test-browser test-oracle test-matrix parity lint format lock licences audit clean
+.PHONY: demo torture test test-slow test-browser test-oracle test-matrix parity lint format lock licences audit clean
 
 demo: $(READY)
 	$(BIN)/freegeo demo --output out/demo
@@ -21,6 +21,11 @@ test-browser: $(READY)
 test-oracle: $(READY)
 	$(BIN)/pip install -q -c constraints.txt -e '.[oracle]'
 	$(PYTEST) -m oracle
+
+# Damages every kind of file that is read. TORTURE: number of cases and seed.
+TORTURE := 20000 1
+torture: $(READY)
+	cd tests && OMP_NUM_THREADS=1 ../$(BIN)/python -m torture.fuzz $(TORTURE)
 
 # The suite with each instruction set of PyTorch and code path of MKL, with one and two threads: one line per setting.
 # MATRIX_ARGS are passed on to pytest; reports of failures stay in out/matrix.

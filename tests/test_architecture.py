@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "src" / "freegeo"
-ANYWHERE = {"types", "errors", "files", "lock", "run_folder", "__init__"}
+ANYWHERE = {"types", "errors", "host", "files", "lock", "run_folder", "__init__"}
 ALLOWED = {
     "job": {
         *("models", "data", "adaptation", "evidence", "fusion", "export", "report"),
@@ -43,6 +43,7 @@ ALLOWED = {
     "geometry": set(),
     "types": set(),
     "errors": set(),
+    "host": set(),
     "files": set(),
     "lock": set(),
     "run_folder": set(),

@@ -1,5 +1,7 @@
 """The errors a user may see: one sentence that says what is wrong, where, and what to do."""
 
+_LONGEST_REASON = 300
+
 
 class FreeGeoError(Exception):
     """The work failed for a reason we understand (exit code 1)."""
@@ -7,6 +9,15 @@ class FreeGeoError(Exception):
 
 class UserError(FreeGeoError, ValueError):
     """The request cannot be carried out as asked; the sentence says what to change (exit code 2)."""
+
+
+class DamagedError(FreeGeoError):
+    """A file that freegeo wrote, or one like it, whose content is not what it has to be."""
+
+    def __init__(self, path: object, reason: object, advice: str) -> None:
+        text = " ".join(str(reason).split())
+        self.reason = text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}..."
+        super().__init__(f"{path}: damaged file ({self.reason}). {advice}")
 
 
 class PartialResultError(FreeGeoError):

@@ -16,17 +16,20 @@ import shutil
 import struct
 import zipfile
 import zlib
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tokenize import TokenError
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import DamagedError, FreeGeoError, UserError
+from freegeo.host import host_available
 from freegeo.lock import LOCK_FILE, Lock, note_removed, note_written, require_lock, require_no_link
 
 if TYPE_CHECKING:
     import numpy as np
+    from torch import Tensor
 
 FORMAT = 1
 """Version of the files that freegeo writes."""
@@ -41,6 +44,16 @@ _LOCAL_HEADER, _ZIP64_FIELD = 30, 20
 """Bytes of the header before a member of a zip file, without its name and extra fields, and of the field for sizes."""
 _PADDING_KIND, _ALIGNMENT = 0xD935, 64
 _BLOCK = 1 << 20
+_MOST_PACKED = 1100
+"""No more bytes than this come out of one byte of a zip file."""
+_NPZ_ERRORS = (
+    zipfile.BadZipFile, zlib.error, struct.error, ValueError, RuntimeError, EOFError, LookupError, TypeError,
+    SyntaxError, TokenError, OverflowError, MemoryError, AttributeError,
+)  # fmt: skip
+"""What NumPy and zipfile raise for damaged files."""
+AGAIN = "Remove it and run again."
+Kind = tuple[str, tuple[int, ...]]
+"""Of an array: the letters of the types that it may have (`numpy.dtype.kind`), and its shape, -1 for any length."""
 _PART = re.compile(r"\..+\.[0-9a-f]{8}\.part(\..*)?")
 
 
@@ -189,6 +202,13 @@ def fitted(name: str) -> str:
     return path.with_name(stem + ending).as_posix()
 
 
+def require_writable(folder: Path) -> None:
+    """Raise UserError when files cannot be made in a folder, or the folder itself cannot: a check before long work."""
+    existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        raise UserError(f"{folder}: the output folder cannot be written to. Choose another one.")
+
+
 def keep_ledger(folder: Path) -> None:
     """Make a folder that notes down what is written below it; a part of an output folder does so already."""
     if _owner(folder / LEDGER_FILE) is None:
@@ -303,12 +323,32 @@ def write_json(path: Path, value: Any) -> None:
         part.write_text(json.dumps(value, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def read_json(path: Path) -> Any:
-    """Read JSON; FreeGeoError when the file is damaged."""
+def read_json(path: Path, schema: Any = Any, *, advice: str = AGAIN) -> Any:
+    """Read JSON, and check it against a type such as a TypedDict; fields that the type does not name are kept.
+
+    DamagedError, which ends with `advice`, when the file is no JSON or not of that type.
+    """
+    return json_of(read_text(path, advice=advice), path, schema, advice=advice)
+
+
+def read_text(path: Path, *, advice: str = AGAIN) -> str:
+    """Read a file of text; DamagedError when it is none."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise FreeGeoError(f"{path}: damaged file ({error}). Remove it and run again.") from None
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise DamagedError(path, error, advice) from None
+
+
+def json_of(text: str, path: Path, schema: Any = Any, *, advice: str = AGAIN) -> Any:
+    """Return the value of a JSON text that was read from `path`; errors as `read_json`."""
+    import msgspec
+
+    try:
+        value = json.loads(text)
+        msgspec.convert(value, schema)
+    except (ValueError, RecursionError) as error:  # numbers of too many digits, msgspec.ValidationError
+        raise DamagedError(path, error, advice) from None
+    return value
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
@@ -370,66 +410,153 @@ def _padding(start: int, entry: zipfile.ZipInfo) -> bytes:
     return struct.pack("<HH", _PADDING_KIND, -before % _ALIGNMENT) + bytes(-before % _ALIGNMENT)
 
 
-def read_npz(path: Path) -> dict[str, np.ndarray]:
+def read_npz(
+    path: Path, kinds: Mapping[str, Kind] | None = None, *, optional: Collection[str] = (), advice: str = AGAIN
+) -> dict[str, np.ndarray]:
     """Read the arrays of an .npz file, and map those that are stored in it uncompressed.
 
     Mapped ones (`np.memmap`) are read when they are used and can be larger than memory; writing into them changes
-    neither the file nor what others read. All content is compared with its checksum here.
+    neither the file nor what others read. All content is compared with its checksum here. Nothing is allocated before
+    the headers have been checked: against `kinds`, the file, and the free memory.
+
+    Args:
+        path: of the file.
+        kinds: the arrays to read, of which all but `optional` must be there; None: all in the file.
+        optional: names in `kinds`.
+        advice: what the user has to do when the file is damaged.
 
     Raises:
-        FreeGeoError: the file is damaged.
+        DamagedError: the file is damaged, or not of these kinds.
+        FreeGeoError: the file cannot be read, or its content is larger than the free memory.
     """
-    import numpy as np
-
     arrays: dict[str, np.ndarray] = {}
     try:
         with zipfile.ZipFile(path) as archive:
-            for entry in archive.infolist():
-                if entry.filename.endswith(".npy"):
-                    mapped = _mapped(path, archive, entry) if entry.compress_type == zipfile.ZIP_STORED else None
-                    if mapped is None:
-                        with archive.open(entry) as stream:
-                            mapped = np.lib.format.read_array(stream, allow_pickle=False)
-                    arrays[entry.filename.removesuffix(".npy")] = mapped
-    except (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, OSError) as error:
-        raise FreeGeoError(f"{path}: damaged file ({error}). Remove it and run again.") from None
+            entries = {e.filename.removesuffix(".npy"): e for e in archive.infolist() if e.filename.endswith(".npy")}
+            entries = {name: entry for name, entry in entries.items() if kinds is None or name in kinds}
+            missing = [name for name in kinds or () if name not in entries and name not in optional]
+            if missing:
+                raise ValueError(f"{', '.join(missing)} missing")
+            headers = {
+                name: _checked_header(archive, entry, None if kinds is None else kinds[name])
+                for name, entry in entries.items()
+            }
+            _require_room(path, [header.size for header in headers.values() if not header.mappable])
+            for name, entry in entries.items():
+                arrays[name] = _content(path, archive, entry, headers[name])
+    except OSError as error:
+        raise FreeGeoError(f"{path}: cannot be read ({error.strerror or error}).") from None
+    except _NPZ_ERRORS as error:
+        raise DamagedError(path, error, advice) from None
     return arrays
 
 
-def _mapped(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray | None:
-    """Return a stored member as an array in the file; None for what cannot be mapped, such as a single number.
+class _Header(NamedTuple):
+    """What a member of an .npz file says about its array."""
 
-    ValueError, or BadZipFile, when it is damaged.
-    """
+    start: int
+    """Bytes before the numbers."""
+    shape: tuple[int, ...]
+    columns_first: bool
+    dtype: np.dtype
+    mappable: bool
+
+    @property
+    def size(self) -> int:
+        """Bytes of the numbers."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def _checked_header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, kind: Kind | None) -> _Header:
+    """Read the header of an array; ValueError when it does not fit the file or the kind."""
     import numpy as np
 
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     with archive.open(entry) as stream:
         version = np.lib.format.read_magic(stream)
         if version not in read_header:
-            return None
+            raise ValueError(f"{entry.filename} is of version {version}")
         shape, columns_first, dtype = read_header[version](stream)
-        header = stream.tell()
-        # The checksum is compared at the end.
-        while stream.read(_BLOCK):
-            pass
-    with path.open("rb") as file:
-        file.seek(entry.header_offset)
-        name, extra = struct.unpack("<HH", file.read(_LOCAL_HEADER)[-4:])
-    start = entry.header_offset + _LOCAL_HEADER + name + extra + header
-    size = math.prod(shape) * dtype.itemsize
-    # Without alignment computing on the array would be slow, or impossible.
-    if dtype.hasobject or not shape or min(shape) < 1 or start % dtype.alignment:
-        return None
-    if header + size > entry.file_size:
-        raise ValueError(f"{entry.filename} is too short")
-    return np.memmap(path, dtype, mode="c", offset=start, shape=shape, order="F" if columns_first else "C")
+        start = stream.tell()
+    # Without alignment computing on the array would be slow, or impossible; a single number cannot be mapped.
+    stored = entry.compress_type == zipfile.ZIP_STORED
+    header = _Header(start, shape, columns_first, dtype, stored and bool(shape) and min(shape) > 0)
+    if dtype.hasobject:
+        raise ValueError(f"{entry.filename} holds objects, which are not read")
+    if min(shape, default=0) < 0 or start + header.size != entry.file_size:
+        raise ValueError(f"{entry.filename} does not have the size that its header says")
+    if entry.file_size > _MOST_PACKED * (entry.compress_size + 1):
+        raise ValueError(f"{entry.filename} cannot be packed into {entry.compress_size} bytes")
+    if kind is not None and not _is_of_kind(header, kind):
+        raise ValueError(f"{entry.filename.removesuffix('.npy')} is {dtype} of the shape {shape}")
+    return header
+
+
+def _is_of_kind(header: _Header, kind: Kind) -> bool:
+    types, wanted = kind
+    fits = zip(header.shape, wanted, strict=False)
+    return header.dtype.kind in types and len(header.shape) == len(wanted) and all(w in (-1, n) for n, w in fits)
+
+
+def _require_room(path: Path, sizes: Iterable[int]) -> None:
+    needed, free = sum(sizes), host_available()
+    if needed > free:
+        raise FreeGeoError(
+            f"{path}: unpacks to {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB of memory are free. Close other "
+            "programs, or use another machine; if the file is not that of a large result, remove it."
+        )
+
+
+def _content(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, header: _Header) -> np.ndarray:
+    """Return a member as an array in the file, where that is possible, else in memory."""
+    import numpy as np
+
+    if header.mappable:
+        with archive.open(entry) as stream:
+            # The checksum is compared at the end.
+            while stream.read(_BLOCK):
+                pass
+        with path.open("rb") as file:
+            file.seek(entry.header_offset)
+            name, extra = struct.unpack("<HH", file.read(_LOCAL_HEADER)[-4:])
+        start = entry.header_offset + _LOCAL_HEADER + name + extra + header.start
+        if start % header.dtype.alignment == 0:
+            order = "F" if header.columns_first else "C"
+            return np.memmap(path, header.dtype, mode="c", offset=start, shape=header.shape, order=order)
+    with archive.open(entry) as stream:
+        return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+@contextmanager
+def damaged_tensors(translate: Callable[[Exception], Exception]) -> Generator[None]:
+    """Raise what `translate` returns in place of what the reader of safetensors raises for a damaged file."""
+    from safetensors import SafetensorError
+
+    try:
+        yield
+    except (SafetensorError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RuntimeError) as error:
+        raise translate(error) from None
+
+
+def read_tensors(path: Path, *, advice: str = AGAIN) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read what `write_tensors` wrote: tensors and metadata; DamagedError when it is damaged."""
+    from safetensors import safe_open
+
+    with damaged_tensors(lambda error: DamagedError(path, error, advice)), safe_open(path, framework="pt") as file:
+        return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
-    """Write tensors as safetensors atomically."""
+    """Write tensors as safetensors atomically; OSError when the disk is full, as every other writer."""
+    from safetensors import SafetensorError
     from safetensors.torch import save_file
 
     with atomic_path(path) as part:
         contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-        save_file(contiguous, part, metadata=dict(metadata or {}))
+        try:
+            save_file(contiguous, part, metadata=dict(metadata or {}))
+        except SafetensorError as error:
+            number = re.search(r"os error (\d+)", str(error))
+            if number is None:
+                raise
+            raise OSError(int(number[1]), os.strerror(int(number[1])), str(path)) from None

@@ -2,21 +2,20 @@
 
 A command's output folder goes through three states: absent, unfinished (its settings are stored, its files appear one
 by one) and finished (the marker names when). Settings may be ordered in parts: when a part changes, the files that
-depend on it or on a later part go, and the others stay. Only the standard library is used here.
+depend on it or on a later part go, and the others stay.
 """
 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Required, TypedDict
 
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import UserError
 from freegeo.files import (
     FORMAT,
     LEDGER_FILE,
@@ -29,6 +28,7 @@ from freegeo.files import (
     read_json,
     remove_listed,
     remove_parts,
+    require_writable,
     start_ledger,
     write_json,
     write_ledger,
@@ -36,6 +36,15 @@ from freegeo.files import (
 from freegeo.lock import Lock, locked, lost
 
 _SHOWN = 4
+
+
+class _State(TypedDict, total=False):
+    """Content of `RUN_FILE`."""
+
+    format: Required[int]
+    settings: Required[dict[str, Any]]
+    finished: Required[str | None]
+    notes: dict[str, Any] | None
 
 
 @dataclass(frozen=True)
@@ -210,7 +219,7 @@ def check_folder(
     if before is None:
         if path.is_dir() and any(p.name not in OWN_FILES and not _is_left_over(p) for p in path.iterdir()):
             raise UserError(f"{path}: holds files that freegeo did not write. Choose an empty or a new folder.")
-        _require_writable(path)
+        require_writable(path)
         return
     if before["format"] > FORMAT:
         raise UserError(f"{path}: written by a newer freegeo (format {before['format']}). Update freegeo.")
@@ -221,7 +230,7 @@ def check_folder(
             f"{path}: holds {state} with other options ({difference(before['settings'], settings, labels)}). "
             "Add --overwrite to replace it, or choose another folder."
         )
-    _require_writable(path)
+    require_writable(path)
 
 
 def _is_left_over(path: Path) -> bool:
@@ -234,10 +243,7 @@ def stored_state(path: Path) -> dict[str, Any] | None:
     file = path / RUN_FILE
     if not file.is_file():
         return None
-    state = read_json(file)
-    if not isinstance(state, dict) or not {"format", "settings", "finished"} <= set(state):
-        raise FreeGeoError(f"{file}: not the state of a run. Choose another output folder.")
-    return state
+    return read_json(file, _State, advice="Choose another output folder.")
 
 
 def clear(path: Path, *, keep: Callable[[str], bool] = lambda name: False) -> None:
@@ -269,12 +275,6 @@ def difference(before: Mapping[str, Any], now: Mapping[str, Any], labels: Mappin
 
 def _state(settings: Mapping[str, Any], finished: str | None, notes: Mapping[str, Any]) -> dict[str, Any]:
     return {"format": FORMAT, "settings": settings, "finished": finished, "notes": notes}
-
-
-def _require_writable(path: Path) -> None:
-    existing = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
-    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
-        raise UserError(f"{path}: the output folder cannot be written to. Choose another one.")
 
 
 def _differences(

@@ -219,8 +219,7 @@ class SequenceJob(Job):
         """What each frame shows, (N, C) of unit length; in the file in the order given."""
         file = self.folder / DESCRIPTORS_NAME
         if file.is_file():
-            with np.load(file, allow_pickle=False) as content:
-                return content["descriptors"]
+            return files.read_npz(file, {"descriptors": ("f", (len(self.batch), -1))})["descriptors"]
         count = len(self.batch)
         with self._timed("what each photo shows"):
             parts = (

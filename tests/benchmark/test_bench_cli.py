@@ -113,7 +113,7 @@ def test_a_damaged_scene_is_named_and_the_others_are_scored(freegeo, options, tm
     code, _, err = freegeo("run", "long-sequence", *options)
     assert code == 1
     assert f"{DATASET} {ROOMS[1]}: predict" in err
-    assert "damaged room" in err
+    assert "damaged file" in err
     problems = json.loads((tmp_path / "out" / "problems.json").read_text())
     assert {problem["scene"] for problem in problems if problem["stage"] == "predict"} == {ROOMS[1]}
     assert ROOMS[0] in (tmp_path / "out" / "results.csv").read_text()

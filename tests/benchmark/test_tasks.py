@@ -265,7 +265,7 @@ def test_recipe_evidence_is_refused_as_the_benchmark_makes_no_cameras_to_learn(s
 )  # fmt: skip
 def test_a_task_belongs_to_the_folder_that_it_lies_in(tmp_path, change):
     one = task()
-    finish(one, tmp_path, {})
+    finish(one, tmp_path, {"model": "tiny"}, frames=[0])
     path = one.folder(tmp_path) / TASK_FILE
     outside = tmp_path.parent / f"{tmp_path.name}-outside"
     outside.mkdir()

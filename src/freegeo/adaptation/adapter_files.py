@@ -18,13 +18,13 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Required, TypedDict
 
 import torch
 from torch import Tensor
 
 from freegeo.adaptation.adapter import Adapter
-from freegeo.errors import UserError
+from freegeo.errors import DamagedError, UserError
 from freegeo.files import FORMAT, atomic_path, read_json, write_json, write_tensors
 from freegeo.models.checkpoints import read_tensors, require_match, require_sound
 
@@ -95,12 +95,12 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
             ours, shapes, f"{folder}: this adapter does not fit {model.spec.name}", "Check --model and --adapter."
         )
         adapter.load(tensors)
-    except UserError:
+        for parameter in adapter.parameters():
+            parameter.requires_grad_(False)
+        adapter.set_strength(float((metadata or {}).get("strength", 1)))
+    except BaseException:
         adapter.detach()
         raise
-    for parameter in adapter.parameters():
-        parameter.requires_grad_(False)
-    adapter.set_strength(float((metadata or {}).get("strength", 1)))
     return adapter
 
 
@@ -124,15 +124,31 @@ def find_adapter(path: str | Path) -> Path:
     return published[0] if published else folder
 
 
+class _Base(TypedDict):
+    model: str
+    fingerprint: str
+
+
+class Metadata(TypedDict, total=False):
+    """Content of `METADATA`, as far as it is read again."""
+
+    format: Required[int]
+    base: Required[_Base]
+    strength: float
+
+
 def adapter_metadata(folder: Path) -> dict[str, Any] | None:
     """Return freegeo.json of an adapter folder; None for an adapter that freegeo did not write."""
     path = folder / METADATA
     if not path.is_file():
         return None
-    metadata = read_json(path)
-    base = metadata.get("base") if isinstance(metadata, dict) else None
-    if not isinstance(base, dict) or not {"model", "fingerprint"} <= base.keys() or "format" not in metadata:
-        raise UserError(f"{path}: does not describe an adapter. Copy the whole folder that `freegeo adapt` wrote.")
+    try:
+        metadata = read_json(path, Metadata)
+    except DamagedError as error:
+        advice = "Copy the whole folder that `freegeo adapt` wrote."
+        raise UserError(f"{path}: does not describe an adapter ({error.reason}). {advice}") from None
+    if not math.isfinite(metadata.get("strength", 1)):
+        raise UserError(f"{path}: the strength {metadata['strength']} is no number. Copy the whole folder again.")
     if metadata["format"] > FORMAT:
         raise UserError(f"{folder}: written by a newer freegeo (format {metadata['format']}). Update freegeo.")
     return metadata

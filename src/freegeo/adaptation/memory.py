@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import shutil
 import tempfile
 from collections import Counter
@@ -27,6 +26,7 @@ from freegeo.adaptation.recipe import Recipe
 from freegeo.adaptation.samples import Place, SceneImages, distinct, sample_key, view_keys
 from freegeo.adaptation.views import ViewSet, Visit
 from freegeo.errors import UserError
+from freegeo.host import host_available
 from freegeo.models.api import ReconstructionModel, views_per_chunk
 from freegeo.models.precision import Compute
 
@@ -384,17 +384,6 @@ def available(device: torch.device, model: ReconstructionModel) -> int:
         free = int(host_available() * 0.8)
     weights = sum(p.nbytes for p in model.parameters() if p.device.type == device.type)
     return free + weights
-
-
-def host_available() -> int:
-    """Bytes of main memory that are free or can be freed."""
-    lines = Path("/proc/meminfo").read_text().splitlines() if Path("/proc/meminfo").is_file() else []
-    for line in lines:
-        if line.startswith("MemAvailable:"):
-            return int(line.split()[1]) * 1024
-    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return 8 << 30
 
 
 def _gigabytes(size: int) -> str:

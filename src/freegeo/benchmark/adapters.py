@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Required, TypedDict
 
 import torch
 
@@ -82,6 +82,17 @@ class AdapterJob:
         return len(schedule([count for count in counts if count >= SMALLEST_SCENE], self.recipe, self.seed))
 
 
+class Facts(TypedDict, total=False):
+    """Content of `FINISHED`."""
+
+    steps: Required[int]
+    seconds: Required[float]
+    peak_gb: Required[float]
+    trainable: Required[int]
+    trouble: str | None
+    left_out: Required[list[Problem]]
+
+
 def train(
     job: AdapterJob,
     model: ReconstructionModel,
@@ -96,7 +107,7 @@ def train(
     when none is left.
     """
     if job.is_finished(out):
-        facts = read_json(job.folder(out) / FINISHED)
+        facts = read_json(job.folder(out) / FINISHED, Facts)
         _warn(job, facts.get("trouble"))
         return [Problem(**problem) for problem in facts["left_out"]]
     scenes, problems = _usable_scenes(job, model, data)

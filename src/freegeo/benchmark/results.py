@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from freegeo.benchmark.tasks import FrameRule, Task
-from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import atomic_path
+from freegeo.errors import UserError
+from freegeo.files import atomic_path, json_of, read_text
 from freegeo.metrics.bootstrap import Interval, paired_interval
 
 CSV_FILE, LINES_FILE = "results.csv", "results.jsonl"
@@ -44,6 +44,7 @@ class Row:
 
 
 COLUMNS = tuple(field.name for field in fields(Row))
+_AGAIN = "Evaluate again."
 
 
 def rows_of(task: Task, model: str, frames: int, metrics: Mapping[str, float]) -> list[Row]:
@@ -69,10 +70,9 @@ def read_results(out: Path) -> list[Row]:
     path = Path(out) / LINES_FILE
     if not path.is_file():
         raise UserError(f"{out}: holds no results. Run `freegeo bench evaluate` first.")
-    try:
-        return [Row(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
-    except (json.JSONDecodeError, TypeError) as error:
-        raise FreeGeoError(f"{path}: damaged results ({error}). Evaluate again.") from None
+    lines = read_text(path, advice=_AGAIN).splitlines()
+    found = [json_of(line, path, Row, advice=_AGAIN) for line in lines]
+    return [Row(**{name: row[name] for name in COLUMNS}) for row in found]
 
 
 def choose(rows: Iterable[Row], **wanted: object) -> list[Row]:

@@ -16,7 +16,7 @@ from freegeo.benchmark.frames import fusion_frames, require_prediction, require_
 from freegeo.data.datasets.base import DatasetConstants
 from freegeo.data.datasets.registry import constants
 from freegeo.data.scene import Scene, SceneTruth
-from freegeo.files import write_npz
+from freegeo.files import read_npz, write_npz
 from freegeo.fusion.mesh import Mesh, empty_mesh_substitute, read_mesh, read_points, sample_surface
 from freegeo.fusion.tsdf import TsdfVolume
 from freegeo.metrics.cloud import CloudScore, ReferenceCloud
@@ -78,9 +78,9 @@ def load_reference(scene: Scene, *, seed: int = REFERENCE_SEED_OFFSET, cache: Pa
         return _prepared(read_points(truth.surface), fixed)
     kept = None if cache is None or not truth.surface.is_file() else cache / f"{_mesh_digest(truth, fixed, seed)}.npz"
     if kept is not None and kept.is_file():
-        with np.load(kept, allow_pickle=False) as content:
-            cloud = ReferenceCloud.restored(content["points"], down_sample=fixed.down_sample)
-            return SceneReference(cloud=cloud, box=(content["low"], content["high"]), constants=fixed)
+        content = read_npz(kept, {"points": ("f", (-1, 3)), "low": ("f", (3,)), "high": ("f", (3,))})
+        cloud = ReferenceCloud.restored(content["points"], down_sample=fixed.down_sample)
+        return SceneReference(cloud=cloud, box=(content["low"], content["high"]), constants=fixed)
     reference = _prepared(sample_surface(read_mesh(truth.surface), fixed.samples, seed=seed), fixed)
     if kept is not None:
         write_npz(kept, {"points": reference.cloud.points, "low": reference.box[0], "high": reference.box[1]})

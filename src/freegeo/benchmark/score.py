@@ -7,15 +7,16 @@ depth of frames is known `abs_rel`, `delta1`, for generated rooms also `f1_rel5`
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 
-from freegeo.benchmark.adapters import FINISHED, FOLDER
+from freegeo.benchmark.adapters import FINISHED, FOLDER, Facts
 from freegeo.benchmark.frames import require_prediction
 from freegeo.benchmark.paper.variants import variant
 from freegeo.benchmark.predict import problem_of
@@ -40,16 +41,25 @@ from freegeo.benchmark.tasks import (
 )
 from freegeo.data.datasets.registry import load_scene, true_depth
 from freegeo.data.scene import Scene
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import DamagedError, FreeGeoError, UserError
 from freegeo.files import read_json, remove_file, write_json
 from freegeo.metrics.cloud import f1_rel5
 from freegeo.metrics.depth import score_depth
 from freegeo.metrics.scene import at_size
 from freegeo.run_folder import difference
 
+logger = logging.getLogger(__name__)
+
 EMPTY_SURFACE = "the fusion gave no surface: precision, recall and F1 are 0, distances do not exist"
 _SAME_IN_ALL = ("model", "checkpoint", "precision", "given_cameras")
 _SAME_IN_VARIANT = ("per", "epoch", "recipe", "seed", "scenes")
+
+
+class _Scores(TypedDict):
+    """Content of `SCORES_FILE`."""
+
+    metrics: dict[str, float]
+    failed: dict[str, str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +115,7 @@ def require_same_settings(stored: Mapping[Task, Mapping[str, Any]]) -> None:
         common = {name: configuration.get(name) for name in _SAME_IN_ALL}
         first = first or (task, common)
         _require_equal(first, (task, common))
-        adaptation = configuration["adaptation"]
+        adaptation = configuration.get("adaptation")
         if adaptation is not None:
             # A scene-wise adapter is trained on its own scene only, so the scenes differ.
             names = [name for name in _SAME_IN_VARIANT if name != "scenes" or adaptation["per"] == "dataset"]
@@ -147,11 +157,13 @@ def _scored(
 ) -> list[Problem]:
     """Score one task unless that has been done without a failure; returns the parts that could not be scored."""
     path = task.folder(out) / SCORES_FILE
-    if path.is_file() and not read_json(path)["failed"]:
+    scores = _stored_scores(path)
+    if scores is not None and not scores["failed"]:
         return []
     remove_file(path)
     if variant(task.variant).measures == "features":
-        write_json(path, {"metrics": read_json(task.folder(out) / MEASURED_FILE), "failed": {}})
+        measured = read_json(task.folder(out) / MEASURED_FILE, dict[str, float])
+        write_json(path, {"metrics": measured, "failed": {}})
         return []
     stored = read_stored(task, out)
     scene = ground.scene()
@@ -221,6 +233,15 @@ def _depth_metrics(chosen: Scene, stored: Stored) -> dict[str, float]:
     return {"abs_rel": float(score.abs_rel), "delta1": float(score.delta1)}
 
 
+def _stored_scores(path: Path) -> dict[str, Any] | None:
+    """Return what a task was scored with; None where it has not been, or its file is damaged."""
+    try:
+        return read_json(path, _Scores) if path.is_file() else None
+    except DamagedError as error:
+        logger.warning("%s: the stored scores are damaged (%s); they are computed again.", path, error.reason)
+        return None
+
+
 def _problems(task: Task, failed: Mapping[str, str]) -> list[Problem]:
     what = f"{task.views} views, seed {task.seed}, {task.variant}"
     return [
@@ -231,9 +252,10 @@ def _problems(task: Task, failed: Mapping[str, str]) -> list[Problem]:
 
 def _rows(task: Task, record: Mapping[str, Any], out: Path) -> list[Row]:
     path = task.folder(out) / SCORES_FILE
-    if not path.is_file():
+    scores = _stored_scores(path)
+    if scores is None:
         return []
-    metrics = {**read_json(path)["metrics"], **_costs(record, out)}
+    metrics = {**scores["metrics"], **_costs(record, out)}
     return rows_of(task, record["configuration"]["model"], len(record["frames"]), metrics)
 
 
@@ -241,7 +263,7 @@ def _costs(record: Mapping[str, Any], out: Path) -> dict[str, float]:
     costs = {name: record[name] for name in ("seconds", "peak_gb") if record.get(name) is not None}
     finished = Path(out) / FOLDER / record["task"]["dataset"] / str(record.get("adapter")) / FINISHED
     if finished.is_file():
-        facts = read_json(finished)
+        facts = read_json(finished, Facts)
         costs |= {f"adapt_{name}": facts[name] for name in ("steps", "seconds", "peak_gb")}
         costs["trainable"] = facts["trainable"]
     return costs

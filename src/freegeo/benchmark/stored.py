@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +11,11 @@ import torch
 
 from freegeo.benchmark.tasks import PREDICTION_FILE, Task
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import write_npz
+from freegeo.files import Kind, read_npz, write_npz
 from freegeo.types import Prediction
 
-ARRAYS = ("depth_z", "T_cam_world", "K")
+ARRAYS: dict[str, Kind] = {"depth_z": ("f", (-1, -1, -1)), "T_cam_world": ("f", (-1, 4, 4)), "K": ("f", (-1, 3, 3))}
+_AGAIN = "Remove its folder and predict again."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +43,8 @@ def read_stored(task: Task, out: Path) -> Stored:
     path = task.folder(out) / PREDICTION_FILE
     if not path.is_file():
         raise FreeGeoError(f"{path}: no stored prediction; predict again")
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            arrays = {name: content[name] for name in (*ARRAYS, "frames")}
-    except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError) as error:
-        raise FreeGeoError(f"{path}: damaged prediction ({error}); remove its folder and predict again") from None
+    arrays = read_npz(path, {**ARRAYS, "frames": ("iu", (-1,))}, advice=_AGAIN)
     frames = tuple(int(frame) for frame in arrays.pop("frames"))
-    if not frames or any(len(value) != len(frames) for value in arrays.values()):
+    if not frames or min(frames) < 0 or any(len(value) != len(frames) for value in arrays.values()):
         raise FreeGeoError(f"{path}: an empty or incomplete prediction; remove its folder and predict again")
     return Stored(frames=frames, prediction=Prediction(**{k: torch.from_numpy(v) for k, v in arrays.items()}))

@@ -16,9 +16,9 @@ import logging
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, Required, TypedDict, TypeVar, get_args
 
 import torch
 
@@ -40,7 +40,7 @@ SAMPLE = 8
 """Views of the sample that "8->4", and 4 views of the rules `vggt`, `experiment` and `neighbours`, are taken from."""
 DAMAGED = (
     FreeGeoError, OSError, ValueError, LookupError, EOFError, SyntaxError, ArithmeticError, struct.error, zlib.error,
-    torch.linalg.LinAlgError, torch.OutOfMemoryError,
+    torch.linalg.LinAlgError, torch.OutOfMemoryError, MemoryError,
 )  # fmt: skip
 """What reading damaged data, a full disk or a scene too large for the memory raises; the other scenes go on."""
 
@@ -65,6 +65,37 @@ class Task:
     def __str__(self) -> str:
         """Dataset, scene, views, seed and variant as text."""
         return f"{self.dataset} {self.scene}, {self.views} views, seed {self.seed}, {self.variant}"
+
+
+class _Adaptation(TypedDict):
+    """Of how a task's model was adapted, what decides which results belong together."""
+
+    per: str
+    epoch: Any
+    recipe: Any
+    seed: Any
+    scenes: Any
+
+
+class _Configuration(TypedDict, total=False):
+    """Of what a task was predicted with, what is read."""
+
+    model: Required[str]
+    adaptation: _Adaptation | None
+
+
+class _Record(TypedDict, total=False):
+    """Content of `TASK_FILE`."""
+
+    task: Required[Task]
+    configuration: Required[_Configuration]
+    frames: Required[list[int]]
+    seconds: float | None
+    peak_gb: float | None
+    adapter: str | None
+
+
+_AGAIN = "Remove that folder and predict again."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +155,7 @@ def is_finished(task: Task, out: Path, configuration: Mapping[str, Any], *, over
     path = task.folder(out) / TASK_FILE
     if not path.is_file():
         return False
-    unequal = difference(read_json(path)["configuration"], as_json(configuration))
+    unequal = difference(_record(path)["configuration"], as_json(configuration))
     if unequal and not overwrite:
         raise UserError(
             f"{path.parent}: was predicted with other settings ({unequal}). Choose another output folder, "
@@ -147,19 +178,18 @@ def stored_tasks(out: Path) -> list[tuple[Task, dict[str, Any]]]:
     """
     found = []
     for path in sorted((Path(out) / PREDICTIONS).glob(f"*/*/*/*/{TASK_FILE}")):
-        record = read_json(path)
-        try:
-            task = Task(**record["task"])
-            # Files are written and removed where the task says.
-            fits = task.folder(out) == path.parent
-        except (TypeError, KeyError, AttributeError):
-            fits = False
-        if not fits:
-            raise FreeGeoError(
-                f"{path}: does not describe the task of its folder. Remove that folder and predict again."
-            )
+        record = _record(path)
+        names = {field.name for field in fields(Task)}
+        task = Task(**{name: record["task"][name] for name in names})
+        # Files are written and removed where the task says.
+        if record["task"].keys() != names or task.folder(out) != path.parent:
+            raise FreeGeoError(f"{path}: does not describe the task of its folder. {_AGAIN}")
         found.append((task, record))
     return found
+
+
+def _record(path: Path) -> dict[str, Any]:
+    return read_json(path, _Record, advice=_AGAIN)
 
 
 def run_each(

@@ -15,11 +15,13 @@ with the long names of the options without their dashes, and the arguments by th
 from __future__ import annotations
 
 import errno
+import io
 import os
 import signal
 import sys
 import tomllib
 from collections.abc import Sequence
+from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,6 +37,8 @@ GLOBAL = "Every command takes --config FILE.toml (a table of options per command
 USER_MISTAKE, FAILURE, PARTIAL, INTERRUPTED = 2, 1, 3, 130
 TERMINATED = 143
 """Exit code after SIGTERM."""
+
+HELP = {"--help", "-h"}
 
 COMMANDS = {
     "demo": ("freegeo.cli.demo:demo", "Photograph a generated room, adapt to it, score before and after."),
@@ -108,7 +112,12 @@ def run_command(arguments: Sequence[str]) -> int:
     try:
         rest, config, verbose = split_global(arguments)
         console.configure_logging(verbose)
-        build(config)(rest, exit_on_error=False, print_error=False)
+        # The parser prints help by itself; a reader that goes away (`| head`) does not matter there either.
+        shown = io.StringIO() if HELP & set(rest) else None
+        with nullcontext() if shown is None else redirect_stdout(shown):
+            build(config)(rest, exit_on_error=False, print_error=False)
+        if shown is not None:
+            console.say(shown.getvalue().removesuffix("\n"))
     except cyclopts.CycloptsError as error:
         from freegeo.cli.parsing import explain
 
@@ -121,6 +130,11 @@ def run_command(arguments: Sequence[str]) -> int:
         return console.fail(str(error), FAILURE)
     except KeyboardInterrupt:
         return console.fail("interrupted; the same command continues an unfinished run.", INTERRUPTED)
+    except (MemoryError, RuntimeError) as error:
+        sentence = out_of_memory(error)
+        if sentence is None:
+            raise
+        return console.fail(sentence, FAILURE)
     except OSError as error:
         return _fail_to_write(error)
     except UnicodeEncodeError as error:
@@ -130,8 +144,28 @@ def run_command(arguments: Sequence[str]) -> int:
     return 0
 
 
+def out_of_memory(error: BaseException) -> str | None:
+    """Return what to do about an error of exhausted memory, of this machine or of a device; None for other errors."""
+    text = " ".join(str(error).split())
+    again = "The same command continues an unfinished run."
+    of_device = type(error).__name__ in ("OutOfMemoryError", "AcceleratorError") and "out of memory" in text
+    if of_device or "MPS backend out of memory" in text:
+        return (
+            "the memory of the device does not suffice. Use fewer photos (--max-views, --views), smaller images, "
+            f"--precision bf16 or a smaller --model, or free the device of other work. {again}"
+        )
+    # PyTorch's allocator of main memory raises a plain RuntimeError.
+    if isinstance(error, MemoryError) or "can't allocate memory" in text or "not enough memory" in text:
+        return (
+            "the memory of this machine does not suffice. Use fewer photos (--max-views), smaller images or a smaller "
+            f"--model, or close other programs. {again}"
+        )
+    return None
+
+
 def _fail_to_write(error: OSError) -> int:
-    hint = " Make room and run the same command again; it continues." if error.errno == errno.ENOSPC else ""
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT) and error.filename != console.STANDARD_OUTPUT
+    hint = " Make room and run the same command again; it continues." if full else ""
     return console.fail(f"{error.filename or 'input or output'}: {error.strerror or error}.{hint}", FAILURE)
 
 

@@ -20,6 +20,7 @@ from cyclopts import Parameter
 from freegeo import __version__
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
+from freegeo.cli.export import stored_summary
 from freegeo.cli.files import FileOptions
 from freegeo.cli.jobs import DEFAULT_FILES, adapter_identity, check_place, planned
 from freegeo.cli.options import (
@@ -346,7 +347,7 @@ class _Table:
         if not (folder / SUMMARY_NAME).is_file():
             error = f"{folder}: this machine does not see what was written there; all machines must see the folder."
             return SceneRow(**about, outcome=FAILED, error=error)
-        summary = read_json(folder / SUMMARY_NAME)
+        summary = stored_summary(folder)
         partial_result = outcome == PARTIAL
         return SceneRow(
             **about, outcome=INCOMPLETE if partial_result else outcome_of(summary), views=len(summary["images"]),
@@ -357,15 +358,14 @@ class _Table:
 
 
 def _stored_rows(path: Path) -> dict[str, SceneRow]:
-    """Read what an earlier batch wrote about its scenes, by their names."""
-    from freegeo.report.overview import SceneRow
+    """Read what an earlier batch wrote about its scenes, by their names; DamagedError when it is not that."""
+    from freegeo.report.overview import Batch, SceneRow
 
     if not path.is_file():
         return {}
-    try:
-        return {row["name"]: SceneRow(**row) for row in read_json(path)["scenes"]}
-    except (TypeError, KeyError):
-        raise FreeGeoError(f"{path}: not the record of a batch. Remove it and run again.") from None
+    rows = read_json(path, Batch)["scenes"]
+    names = {field.name for field in fields(SceneRow)}
+    return {row["name"]: SceneRow(**{name: row[name] for name in names & row.keys()}) for row in rows}
 
 
 def _command_line(work: _Work, again: bool) -> list[str]:

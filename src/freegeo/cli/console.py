@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
+STANDARD_OUTPUT = "standard output"
 _typed: list[str] = []
 _warned: list[str] = []
 
@@ -115,12 +116,13 @@ def _write(text: str, stream: TextIO) -> None:
         with contextlib.suppress(OSError), Path(os.devnull).open("w") as nowhere:
             os.dup2(nowhere.fileno(), stream.fileno())
         if error.errno not in (errno.EPIPE, errno.EINVAL):  # the second on Windows
-            raise
+            raise OSError(error.errno, error.strerror, STANDARD_OUTPUT) from None
 
 
 def fail(sentence: str, code: int) -> int:
-    """Print why a command stopped and return its exit code."""
-    note(f"freegeo: {sentence}")
+    """Print why a command stopped and return its exit code, also where nothing can be printed."""
+    with contextlib.suppress(OSError):
+        note(f"freegeo: {sentence}")
     return code
 
 

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from freegeo.cli import console
 from freegeo.cli.files import FORMAT_NAMES, FilterOptions, require_complete
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import UserError
 from freegeo.export.base import MAX_TRACKS
 from freegeo.fusion.settings import MAX_POINTS
 
@@ -116,28 +116,16 @@ def result_folder(folder: Path) -> Path | None:
 
 
 def stored_summary(folder: Path) -> dict[str, Any]:
-    """Return what later commands read of reconstruction.json in a folder; FreeGeoError when it is damaged.
+    """Return what later commands read of reconstruction.json in a folder; DamagedError when it is damaged.
 
-    `images` and `photo_files` are lists (of names; of records with texts `file` and `sha256`, or None), `refinement` is
-    an object, `warnings` a list; each is empty where the file, or the field, is missing.
+    `images`, `photo_files`, `refinement` and `warnings` are empty where the file, or the field, is missing.
     """
-    from freegeo.files import read_json
     from freegeo.job import SUMMARY_NAME
+    from freegeo.report.schema import Summary, read_part
 
-    file = folder / SUMMARY_NAME
-    content = read_json(file) if file.is_file() else {}
-    if isinstance(content, dict):
-        fields = {"images": list, "photo_files": list, "refinement": dict, "warnings": list}
-        summary = content | {name: content.get(name) or kind() for name, kind in fields.items()}
-        records = summary["photo_files"] if isinstance(summary["photo_files"], list) else [()]
-        if all(isinstance(summary[name], kind) for name, kind in fields.items()) and all(map(_is_record, records)):
-            return summary
-    raise FreeGeoError(f"{file}: damaged file. Remove it, or run again.")
-
-
-def _is_record(value: Any) -> bool:
-    texts = [value.get(name) for name in ("file", "sha256")] if isinstance(value, dict) else []
-    return value is None or (len(texts) == 2 and all(isinstance(text, str) and "\0" not in text for text in texts))
+    summary = read_part(folder / SUMMARY_NAME, Summary)
+    empty = {"images": [], "photo_files": [], "refinement": {}, "warnings": []}
+    return summary | {name: summary.get(name) or nothing for name, nothing in empty.items()}
 
 
 def find_photos(reconstruction: Reconstruction, run: Path) -> list[Photo] | None:
@@ -156,7 +144,7 @@ def find_photos(reconstruction: Reconstruction, run: Path) -> list[Photo] | None
     ):
         record = records.get(name)
         file = Path(record["file"]) if record else run
-        if not record or not file.is_file() or content_hash(file) != record["sha256"]:
+        if not record or "\0" in record["file"] or not file.is_file() or content_hash(file) != record["sha256"]:
             places = [f"{folder}{FOLDER}/{copy}" for folder in ("", f"{colmap.FORMAT.path}/")]
             copied = [run / place for place in places if place in own and (run / place).is_file()]
             if not copied:

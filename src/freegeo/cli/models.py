@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
 from freegeo.cli import console
+from freegeo.errors import FreeGeoError
 from freegeo.models import catalog
 from freegeo.progress import progress_bar
 
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
     from freegeo.models.api import ReconstructionModel
     from freegeo.models.spec import ModelEntry
 
+logger = logging.getLogger(__name__)
 app = App(name="models", help="List, describe, download and check models.", help_format="plaintext")
 TABLE_WIDTH = 100
 RANKS = (8, 16, 32, 64)
@@ -25,7 +28,16 @@ VIEWS = 8
 def list_models() -> None:
     """List all models that can be used."""
     header = ("model", "licence", "download", "memory", "about")
-    console.say(console.table(header, [_row(name) for name in catalog.names()], prose=TABLE_WIDTH))
+    rows = []
+    for name in catalog.names():
+        try:
+            rows.append(_row(name))
+        except Exception as error:
+            told = catalog.broken(name, error)
+            if not isinstance(told, FreeGeoError):
+                raise
+            logger.warning("%s", told)
+    console.say(console.table(header, rows, prose=TABLE_WIDTH))
     console.say("\nLicences are those of the weights; memory is what reconstructing 8 photos takes.")
     console.say("`freegeo models describe NAME` says more about one model.")
 
@@ -200,6 +212,7 @@ def score(
     from freegeo.cli.options import use_few_threads
     from freegeo.data.procedural import get_domain
     from freegeo.errors import UserError
+    from freegeo.files import require_writable
     from freegeo.training.camera_card import CAMERA_DOMAINS, camera_card, camera_tables
     from freegeo.training.report_card import REPORTED_DOMAINS, card_tables, gate_lines, report_card
     from freegeo.training.state import trained_model
@@ -208,6 +221,7 @@ def score(
     names = reported if domains is None else tuple(name.strip() for name in domains.split(","))
     if rooms < 1:
         raise UserError(f"--rooms must be at least 1, got {rooms}.")
+    require_writable(output.parent)
     for name in names:
         get_domain(name).seeds(rooms)
     if checkpoint and catalog.entry(model).name == catalog.EMBEDDED_MODEL:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import os
 import re
 import tomllib
@@ -29,6 +30,8 @@ from freegeo.errors import UserError
 FORMS = {int: "N", float: "X", Path: "PATH", str: "TEXT"}
 """What stands for a value of an option, by its type."""
 NUMBERS = {int: "a whole number", float: "a number", bool: "true or false"}
+_SHOWN = 40
+"""Most characters of a value that a message shows."""
 _WHOLE = re.compile(r"[+-]?\d+")
 
 Reader = Callable[[App, tuple[str, ...], ArgumentCollection], None]
@@ -37,7 +40,7 @@ Reader = Callable[[App, tuple[str, ...], ArgumentCollection], None]
 def readers(config: Path | None) -> list[Reader]:
     """Return what the parser calls between reading a command line and converting its values."""
     if config is None:
-        return [_require_whole_numbers]
+        return [_require_numbers]
     content = _at_home(tomllib.loads(config.read_text(encoding="utf-8")))
 
     def read(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
@@ -48,7 +51,7 @@ def readers(config: Path | None) -> list[Reader]:
             table = {command: table}
         Dict(table, source=str(config))(app, commands, arguments)
 
-    return [read, _require_whole_numbers]
+    return [read, _require_numbers]
 
 
 def _at_home(value: Any) -> Any:
@@ -89,12 +92,36 @@ def _join_lists(table: dict[str, Any], arguments: ArgumentCollection) -> None:
             table[name] = ",".join(str(part) for part in value)
 
 
-def _require_whole_numbers(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
-    """Refuse 1.5 where a whole number is wanted; the parser would round it."""
+def _require_numbers(app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
+    """Refuse 1.5 where a whole number is wanted, which the parser would round, and numbers that nothing can be."""
     for argument in arguments:
-        for token in argument.tokens if _kind(argument) is int else ():
-            if not _WHOLE.fullmatch(token.value):
-                raise UserError(f"{_place(token, argument)}: '{token.value}' is not a whole number.")
+        for token in argument.tokens:
+            wrong = _CHECKS.get(_kind(argument), lambda text: None)(token.value)
+            if wrong is not None:
+                raise UserError(f"{_place(token, argument)}: '{_short(token.value)}' is {wrong}.")
+
+
+def _wrong_whole(text: str) -> str | None:
+    if not _WHOLE.fullmatch(text):
+        return "not a whole number"
+    fits = len(text) <= _DIGITS and -(2**63) <= int(text) < 2**64
+    return None if fits else "too large a number"
+
+
+def _wrong_float(text: str) -> str | None:
+    try:
+        return None if math.isfinite(float(text)) else "not a finite number"
+    except ValueError:
+        return "not a number"
+
+
+_CHECKS: dict[Any, Callable[[str], str | None]] = {int: _wrong_whole, float: _wrong_float}
+_DIGITS = 20
+"""Most characters of a whole number of 64 bits."""
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
 def explain(error: CycloptsError) -> str:

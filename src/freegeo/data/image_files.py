@@ -245,7 +245,10 @@ def _stored_channels(path: Path) -> np.ndarray:
     """Read a colour image of 16 bits, (H, W, 3 or 4) uint16, not turned."""
     import cv2
 
-    values = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    try:
+        values = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise _damaged(path, error) from None
     if values is None or values.dtype != np.uint16 or values.ndim != 3:
         raise UnreadableImageError(path, "16 bits a channel in a kind of file that is not supported: save it with 8")
     return cv2.cvtColor(values, cv2.COLOR_BGRA2RGBA if values.shape[2] == 4 else cv2.COLOR_BGR2RGB)

@@ -61,11 +61,21 @@ class VideoFrame:
 
     def read(self) -> np.ndarray:
         """Decode to upright RGB (H, W, 3) uint8. FreeGeoError when the file has changed since."""
+        from av.error import FFmpegError
+
         for seek in (True, False) if self.pts is not None else (False,):
-            with _opened(self.path) as container:
-                frame = self._find(container, seek)
-                if frame is not None:
-                    return _shown(frame, _pixel_aspect(container))
+            try:
+                with _opened(self.path) as container:
+                    frame = self._find(container, seek)
+                    if frame is not None:
+                        return _shown(frame, _pixel_aspect(container))
+            except UserError:
+                raise
+            except (FFmpegError, OSError, ValueError) as error:
+                # Where a file cannot be sought in, it is decoded from the start.
+                if not seek:
+                    reason = getattr(error, "strerror", None) or error
+                    raise FreeGeoError(f"{self.path}: frame {self.number} cannot be read ({reason}).") from None
         raise FreeGeoError(f"{self.path}: frame {self.number} is no longer there. Was the video replaced?")
 
     def _find(self, container: Any, seek: bool) -> Any:
@@ -207,6 +217,8 @@ def _way(thumbnails: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _looked_at(container: Any, path: Path) -> Iterator[Candidate]:
+    from av.error import FFmpegError
+
     stream = container.streams.video[0]
     stream.thread_type = "AUTO"
     rate = float(stream.average_rate or _FALLBACK_RATE)
@@ -217,10 +229,13 @@ def _looked_at(container: Any, path: Path) -> Iterator[Candidate]:
         time_s = frame.time if frame.time is not None else number / rate
         start = time_s if start is None else start
         last = max(last, time_s - start)
-        if frame.is_corrupt:
+        try:
+            grey = None if frame.is_corrupt else _grey(frame)
+        except (FFmpegError, OSError, ValueError):
+            grey = None
+        if grey is None:
             damaged += 1
             continue
-        grey = _grey(frame)
         yield Candidate(
             number=number,
             pts=frame.pts,

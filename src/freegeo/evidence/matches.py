@@ -14,8 +14,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import IntEnum
@@ -25,6 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from freegeo import files
+from freegeo.errors import DamagedError
 from freegeo.evidence.features import Extractor, Features, RootSift
 
 if TYPE_CHECKING:
@@ -49,6 +48,12 @@ FILE_NAME = "matches.npz"
 ALL_PAIRS_UP_TO = 16
 """Photos up to which all pairs are compared."""
 VERSION = 1
+_KINDS: dict[str, files.Kind] = {
+    "format": ("iu", ()), "names": ("U", (-1,)), "fingerprint": ("U", ()), "photo_hw": ("i", (-1, 2)),
+    "match_hw": ("i", (-1, 2)), "keypoints": ("f", (-1, 2)), "view_start": ("i", (-1,)), "pairs": ("i", (-1, 2)),
+    "pair_start": ("i", (-1,)), "ends": ("i", (-1, 2)), "flatness": ("f", (-1,)), "tried": ("i", (-1, 2)),
+    "outcome": ("i", (-1,)), "candidates": ("i", (-1,)),
+}  # fmt: skip
 _LEAST_SENSE = 0.6
 """Below this share of neighbouring matches that turn the same way one photo is a mirror image of the other."""
 
@@ -266,15 +271,35 @@ def load_matches(file: Path) -> Matches | None:
     if not file.is_file():
         return None
     try:
-        with np.load(file, allow_pickle=False) as content:
-            arrays = {name: content[name] for name in content.files}
-        if int(arrays.pop("format")) != VERSION:
+        if int(files.read_npz(file, {"format": _KINDS["format"]})["format"]) != VERSION:
             return None
-        names, fingerprint = tuple(str(n) for n in arrays.pop("names")), str(arrays.pop("fingerprint"))
-        return Matches(names=names, fingerprint=fingerprint, **arrays)
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, KeyError, TypeError) as error:
-        logger.warning("%s: the stored matches are damaged (%s); the photos are matched again.", file, error)
+        arrays = files.read_npz(file, _KINDS)
+        names, fingerprint = tuple(arrays.pop("names").tolist()), str(arrays.pop("fingerprint"))
+        del arrays["format"]
+        found = Matches(names=names, fingerprint=fingerprint, **arrays)
+        if not _is_sound(found):
+            raise DamagedError(file, "its numbers do not fit each other", files.AGAIN)
+    except DamagedError as error:
+        logger.warning("%s: the stored matches are damaged (%s); the photos are matched again.", file, error.reason)
         return None
+    return found
+
+
+def _is_sound(found: Matches) -> bool:
+    """Whether there is everything of each photo, pair and match, and every number points to something that exists."""
+    views, pairs, tried = len(found), len(found.pairs), len(found.tried)
+    counts = (
+        (found.photo_hw, views), (found.match_hw, views), (found.view_start, views + 1), (found.pair_start, pairs + 1),
+        (found.flatness, pairs), (found.outcome, tried), (found.candidates, tried),
+    )  # fmt: skip
+    if any(len(values) != count for values, count in counts):
+        return False
+    starts = ((found.view_start, len(found.keypoints)), (found.pair_start, len(found.ends)))
+    ordered = all(s[0] == 0 and s[-1] == count and (np.diff(s) >= 0).all() for s, count in starts)
+    places = ((found.pairs, views), (found.tried, views), (found.ends, len(found.keypoints)))
+    inside = all((values >= 0).all() and (values < count).all() for values, count in places)
+    known = np.isin(found.outcome, [int(outcome) for outcome in Outcome]).all()
+    return bool(ordered and inside and known and np.isfinite(found.keypoints).all())
 
 
 @dataclass(frozen=True, kw_only=True)

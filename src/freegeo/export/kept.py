@@ -13,16 +13,19 @@ The log, the exported files, the report and the viewer all take it from here, so
 from __future__ import annotations
 
 import math
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 
 from freegeo import files
-from freegeo.errors import FreeGeoError
+from freegeo.errors import DamagedError, FreeGeoError
 from freegeo.export.base import KEPT_NAME
 from freegeo.fusion.filtering import FilterReport
+
+_MAPS = ("b", (-1, -1, -1))
+_KINDS: dict[str, files.Kind] = {
+    "keep": _MAPS, "removed_by": ("U", (-1,)), "removed": ("iu", (-1,)), "tolerance": ("f", ()), "masks": _MAPS,
+}  # fmt: skip
 
 Filtered = tuple[np.ndarray, FilterReport]
 
@@ -48,21 +51,17 @@ def load_kept(folder: Path, shape: tuple[int, ...]) -> Filtered | None:
     file = folder / KEPT_NAME
     if not file.is_file():
         return None
-    try:
-        with np.load(file, allow_pickle=False) as content:
-            keep = content["keep"]
-            removed = dict(zip(content["removed_by"].tolist(), content["removed"].tolist(), strict=True))
-            tolerance = float(content["tolerance"])
-            masks = content["masks"] if "masks" in content.files else keep
-    except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, TypeError, EOFError, OSError) as error:
-        raise FreeGeoError(f"{file}: damaged file ({error}). Remove it and run again.") from None
-    if any(one.shape != shape or one.dtype != bool for one in (keep, masks)):
-        raise FreeGeoError(f"{file}: belongs to another reconstruction. Remove it and run again.")
-    tolerances = None if math.isnan(tolerance) else tolerance
-    return keep, FilterReport(pixels=keep.size, removed=removed, tolerance=tolerances)
+    content = files.read_npz(file, _KINDS, optional=("masks",))
+    keep, names, counts = content["keep"], content["removed_by"].tolist(), content["removed"].tolist()
+    if len(names) != len(counts):
+        raise DamagedError(file, "numbers of filters differ", files.AGAIN)
+    if any(content[name].shape != shape for name in ("keep", "masks") if name in content):
+        raise FreeGeoError(f"{file}: belongs to another reconstruction. {files.AGAIN}")
+    tolerance = float(content["tolerance"])
+    removed = dict(zip(names, counts, strict=True))
+    return keep, FilterReport(pixels=keep.size, removed=removed, tolerance=None if math.isnan(tolerance) else tolerance)
 
 
 def load_masks(folder: Path) -> np.ndarray | None:
     """Read the masks (S, H, W) bool that `save_kept` wrote beside what `load_kept` reads; None when there were none."""
-    with np.load(folder / KEPT_NAME, allow_pickle=False) as content:
-        return content["masks"] if "masks" in content.files else None
+    return files.read_npz(folder / KEPT_NAME, {"masks": _KINDS["masks"]}, optional=("masks",)).get("masks")

@@ -6,9 +6,7 @@ pixels are those of the model's images, centres at whole numbers.
 
 from __future__ import annotations
 
-import zipfile
-import zlib
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +15,11 @@ from freegeo import files
 from freegeo.errors import FreeGeoError
 from freegeo.export.base import TRACKS_NAME
 from freegeo.fusion.tracks import Tracks
+
+_KINDS: dict[str, files.Kind] = {
+    "xyz": ("f", (-1, 3)), "colours": ("u", (-1, 3)), "point": ("i", (-1,)), "view": ("i", (-1,)),
+    "pixel": ("f", (-1, 2)),
+}  # fmt: skip
 
 
 def save_tracks(folder: Path, tracks: Tracks) -> Path:
@@ -33,26 +36,16 @@ def load_tracks(folder: Path, views: int) -> Tracks | None:
     file = folder / TRACKS_NAME
     if not file.is_file():
         return None
-    try:
-        with np.load(file, allow_pickle=False) as content:
-            tracks = Tracks(**{field.name: content[field.name] for field in fields(Tracks)})
-    except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError) as error:
-        raise FreeGeoError(f"{file}: damaged file ({error}). Remove it and refine again.") from None
+    tracks = Tracks(**files.read_npz(file, _KINDS, advice="Remove it and refine again."))
     if not _is_sound(tracks, views):
         raise FreeGeoError(f"{file}: damaged, or of another reconstruction. Remove it and refine again.")
     return tracks
 
 
 def _is_sound(tracks: Tracks, views: int) -> bool:
-    """Whether shapes and types are those of tracks, and every number points to something that exists."""
-    points, observations = tracks.xyz.shape[:1], tracks.point.shape
-    expected = {
-        "xyz": ((*points, 3), "f"), "colours": ((*points, 3), "u"), "point": (observations, "i"),
-        "view": (observations, "i"), "pixel": ((*observations, 2), "f"),
-    }  # fmt: skip
-    found = {name: (getattr(tracks, name).shape, getattr(tracks, name).dtype.kind) for name in expected}
-    if found != expected or len(observations) != 1 or len(points) != 1:
+    """Whether there is everything of each point and observation, and every number points to something that exists."""
+    if len(tracks.colours) != len(tracks.xyz) or not len(tracks.point) == len(tracks.view) == len(tracks.pixel):
         return False
     in_order = (np.diff(tracks.point) >= 0).all() and np.isfinite(tracks.xyz).all() and np.isfinite(tracks.pixel).all()
-    numbers = ((tracks.point, points[0]), (tracks.view, views))
+    numbers = ((tracks.point, len(tracks)), (tracks.view, views))
     return bool(in_order and all((values >= 0).all() and (values < count).all() for values, count in numbers))

@@ -44,6 +44,13 @@ VERSION = 1
 METRIC_MODEL = "a metric model"
 _OPTIONAL = ("T_cam_world", "K", "sky")
 _CAMERAS = ("T_cam_world", "K")
+_VIEWS = (-1, -1, -1)
+_KINDS: dict[str, files.Kind] = {
+    "depth_z": ("f", _VIEWS), "conf": ("f", _VIEWS), "images": ("u", (-1, -1, -1, 3)), "names": ("U", (-1,)),
+    "photo_hw": ("iu", (-1, 2)), "scale_xy": ("f", (-1, 2)), "offset_xy": ("f", (-1, 2)),
+    "T_cam_world": ("f", (-1, 4, 4)), "K": ("f", (-1, 3, 3)), "sky": ("f", _VIEWS), "scale_value": ("f", ()),
+    "scale_source": ("U", ()), "scale_spread": ("f", ()), "format": ("iu", ()),
+}  # fmt: skip
 _DTYPES = {"images": np.uint8, "photo_hw": np.int64, "scale_xy": np.float64, "offset_xy": np.float64}
 
 
@@ -317,13 +324,13 @@ class Reconstruction:
             raise UserError(
                 f"{path}: holds no reconstruction ({FILE_NAME} is missing). Run `freegeo reconstruct` first."
             )
-        return cls._from_arrays(files.read_npz(file), file)
+        version = int(files.read_npz(file, {"format": _KINDS["format"]}, optional=("format",)).get("format", VERSION))
+        if version > VERSION:
+            raise UserError(f"{file}: written by a newer freegeo (format {version}). Update freegeo.")
+        return cls._from_arrays(files.read_npz(file, _KINDS, optional=_KINDS), file)
 
     @classmethod
     def _from_arrays(cls, arrays: dict[str, np.ndarray], file: Path) -> Reconstruction:
-        version = int(arrays.get("format", VERSION))
-        if version > VERSION:
-            raise UserError(f"{file}: written by a newer freegeo (format {version}). Update freegeo.")
         names = [f.name for f in fields(cls) if f.name != "scale"]
         missing = [name for name in names if name not in arrays and name not in _OPTIONAL]
         if missing:

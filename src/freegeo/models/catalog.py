@@ -22,6 +22,8 @@ FAMILIES = (
 """Modules, free of torch, that list their models in `ENTRIES`; a new backbone of the package is named here."""
 DEFAULT_MODEL = "da3-base"
 EMBEDDED_MODEL = "freegeo-tiny"
+_SHOWN = 200
+"""Most characters of the error of a plug-in that a message shows."""
 PLUGIN_GROUP = "freegeo.models"
 
 
@@ -43,11 +45,25 @@ def entry(name: str) -> ModelEntry:
     points = {known.lower(): point for known, point in _plugin_points().items()}
     if wanted in points:
         point = points[wanted]
-        item = point.load()
+        try:
+            item = point.load()
+        except Exception as error:
+            raise broken(point.name, error) from error
         if not isinstance(item, ModelEntry):
             raise FreeGeoError(f"the plug-in '{point.name}' ({point.value}) is no ModelEntry. Tell its author.")
         return item
     raise UserError(f"unknown model '{name}'. Known are {', '.join(names())}.")
+
+
+def broken(name: str, error: Exception) -> Exception:
+    """Return the error that says in one sentence that a plug-in does not work; an error of ours comes back as it is."""
+    point = None if name in _own_entries() else _plugin_points().get(name)
+    if point is None or isinstance(error, FreeGeoError):
+        return error
+    reason = " ".join(f"{type(error).__name__}: {error}".split())[:_SHOWN]
+    return FreeGeoError(
+        f"the plug-in '{name}' ({point.value}) does not work ({reason}). Reinstall it, or tell its author."
+    )
 
 
 def warn_of_embedded_model() -> None:
@@ -63,7 +79,11 @@ def build_empty(name: str) -> ReconstructionModel:
     """Build a model on the meta device: shapes and counts, no memory."""
     from freegeo.models.checkpoints import build_on_meta
 
-    return build_on_meta(entry(name).build)
+    item = entry(name)
+    try:
+        return build_on_meta(item.build)
+    except Exception as error:
+        raise broken(item.name, error) from error
 
 
 def load_model(name: str = DEFAULT_MODEL, *, checkpoint: str | Path | None = None) -> ReconstructionModel:
@@ -76,7 +96,7 @@ def load_model(name: str = DEFAULT_MODEL, *, checkpoint: str | Path | None = Non
 
     item = entry(name)
     path = weights_file(name, checkpoint)
-    model = checkpoints.build_on_meta(item.build)
+    model = build_empty(name)
     try:
         checkpoints.load_weights(model, path, item.keys, item.name)
     except UserError as error:

@@ -9,19 +9,21 @@ from __future__ import annotations
 import argparse
 import hashlib
 import logging
+import pickle
 import re
+import struct
 import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypedDict, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from freegeo.errors import UserError
-from freegeo.files import read_json, write_tensors
+from freegeo.errors import DamagedError, UserError
+from freegeo.files import damaged_tensors, fitted, inside, read_json, write_tensors
 from freegeo.models.spec import KeyRules
 
 logger = logging.getLogger(__name__)
@@ -39,7 +41,16 @@ NESTS = ("model", "state_dict", "model_state_dict", "module", "weights", "params
 _BLOCK_BYTES = 1 << 16
 _BLOCKS = 64
 _PART = re.compile(r"-\d+-of-\d+$")
+_PICKLE_ERRORS = (
+    pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, AttributeError, TypeError, OSError,
+    ArithmeticError, MemoryError, AssertionError, struct.error,
+)  # fmt: skip
+"""What PyTorch raises for damaged files."""
 _DTYPES = {"F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16}
+
+
+class _Index(TypedDict):
+    weight_map: dict[str, str]
 
 
 class Stored(NamedTuple):
@@ -90,13 +101,17 @@ def parts_of(path: Path) -> dict[Path, list[str] | None]:
     """Return the files of a checkpoint with the names to read from each; None: all in it."""
     if not path.name.endswith(INDEX):
         return {path: None}
-    index = read_json(path)
-    names = index.get("weight_map") if isinstance(index, dict) else None
-    if not isinstance(names, dict) or not names or not all(isinstance(file, str) for file in names.values()):
+    try:
+        names = read_json(path, _Index)["weight_map"]
+    except DamagedError as error:
+        raise UserError(
+            f"{path}: not the index of a checkpoint ({error.reason}). Give the weight file itself."
+        ) from None
+    if not names:
         raise UserError(f"{path}: not the index of a checkpoint (no weight_map). Give the weight file itself.")
     parts: dict[Path, list[str] | None] = {}
     for file in sorted(set(names.values())):
-        if not (path.parent / file).is_file():
+        if Path(file).name != file or fitted(file) != file or not inside(path.parent, file).is_file():
             raise UserError(f"{path.parent / file}: this part of the checkpoint is missing. Download it too.")
         parts[path.parent / file] = [name for name, place in names.items() if place == file]
     return parts
@@ -118,22 +133,22 @@ def _stored(shape: list[int], dtype: str) -> Stored:
 @contextmanager
 def _readable(path: Path) -> Generator[None]:
     """Turn what the reader of safetensors says about a damaged file into one sentence."""
-    from safetensors import SafetensorError
-
     _require_weights(path)
-    try:
-        yield
-    except SafetensorError as error:
-        reason = str(error).removeprefix("Error while deserializing header: ")
+
+    def sentence(error: Exception) -> UserError:
+        reason = " ".join(str(error).removeprefix("Error while deserializing header: ").split())
         if "not fully covered" in reason or "header length" in reason:
-            raise UserError(
+            return UserError(
                 f"{path}: the file is truncated or damaged ({path.stat().st_size:,} bytes do not agree with its "
                 "header). Download it again."
-            ) from None
-        raise UserError(
-            f"{path}: not a safetensors file, a renamed pickle or damaged ({reason.partition(', expected')[0]}). Use "
-            "the official .safetensors download."
-        ) from None
+            )
+        return UserError(
+            f"{path}: not a safetensors file, a renamed pickle or damaged ({reason.partition(', expected')[0][:200]}). "
+            "Use the official .safetensors download."
+        )
+
+    with damaged_tensors(sentence):
+        yield
 
 
 def _require_weights(path: Path) -> None:
@@ -182,8 +197,6 @@ def _read_part(path: Path) -> dict[str, Tensor]:
 
 
 def _read_pickle(path: Path) -> dict[str, Tensor]:
-    import pickle
-
     _require_weights(path)
     with path.open("rb") as file:
         in_zip = file.read(4) == b"PK\3\4"
@@ -192,7 +205,7 @@ def _read_pickle(path: Path) -> dict[str, Tensor]:
         with torch.serialization.safe_globals([argparse.Namespace]), warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # about the pickle's protocol
             content = torch.load(path, map_location="cpu", mmap=in_zip, weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, IndexError, AttributeError) as error:
+    except _PICKLE_ERRORS as error:
         foreign = re.search(r"GLOBAL ([\w.]+)", str(error))
         if foreign:
             raise UserError(

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from freegeo import files
 from freegeo.report.answer import answer
@@ -33,6 +33,12 @@ class SceneRow:
     """Why it failed, or is incomplete, in one sentence."""
     asked: str | None = None
     """Fingerprint of everything that the result depends on, and when it was finished."""
+
+
+class Batch(TypedDict):
+    """The record of a batch, as far as it is read again."""
+
+    scenes: list[SceneRow]
 
 
 def outcome_of(summary: Mapping[str, Any]) -> str:

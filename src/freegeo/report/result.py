@@ -21,11 +21,12 @@ from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.formats import filter_reconstruction
 from freegeo.export.kept import Filtered, load_kept
 from freegeo.export.reconstruction import FILE_NAME, Reconstruction
-from freegeo.files import FORMAT, read_json
+from freegeo.files import FORMAT
 from freegeo.geometry.depth import depth_to_world, valid_depth
 from freegeo.geometry.rotation import mean_rotation, rotation_angle
 from freegeo.geometry.se3 import camera_centres
 from freegeo.geometry.sim3 import Sim3
+from freegeo.report.schema import AdapterNotes, DemoScores, Summary, read_part
 
 SUMMARY_NAME, SCORES_NAME, REPORT_NAME = "reconstruction.json", "scores.json", "report.html"
 FROZEN_FOLDER, UNREFINED_FOLDER, TRUTH_FOLDER = "frozen", "unrefined", "truth"
@@ -148,7 +149,7 @@ def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
     folder = Path(folder)
     if not (folder / FILE_NAME).is_file():
         raise UserError(f"{folder}: holds no reconstruction ({FILE_NAME} is missing). Name the output folder of a run.")
-    summary = _mapping(folder / SUMMARY_NAME)
+    summary = read_part(folder / SUMMARY_NAME, Summary)
     if summary.get("format", FORMAT) > FORMAT:
         raise UserError(f"{folder}: written by a newer freegeo (format {summary['format']}). Update freegeo.")
     final = Reconstruction.load(folder)
@@ -173,8 +174,8 @@ def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
     return Result(
         folder=folder,
         summary=summary,
-        adaptation=_mapping(folder / ADAPTER_PAGE),
-        scores=_mapping(folder / SCORES_NAME),
+        adaptation=read_part(folder / ADAPTER_PAGE, AdapterNotes),
+        scores=read_part(folder / SCORES_NAME, DemoScores),
         stages=stages,
         names=final.names,
         images=read[last].images,
@@ -347,12 +348,3 @@ def camera_difference(estimate: Stage, reference: Stage) -> tuple[np.ndarray, np
     angle = rotation_angle(a[:, :3, :3], b[:, :3, :3])
     distance = torch.linalg.vector_norm(camera_centres(a) - camera_centres(b), dim=-1)
     return torch.rad2deg(angle).numpy(), distance.numpy()
-
-
-def _mapping(path: Path) -> Mapping[str, Any]:
-    if not path.is_file():
-        return {}
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise FreeGeoError(f"{path}: damaged file (not an object). Remove it and run again.")
-    return content

@@ -14,6 +14,7 @@ Source: docs/benchmark.md, "Files of a scene".
 """
 
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 import torch
@@ -22,9 +23,13 @@ from freegeo.data.datasets.base import Dataset, DatasetConstants, existing, read
 from freegeo.data.photos import open_photos
 from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.files import read_text
 
 NAME = "hiroom"
+_AGAIN = "Download it again."
 SCENE_LIST = "selected_scene_list_val.txt"
+_LARGEST_MATRIX = 1 << 16
+"""Bytes of a file that can hold a matrix of a camera."""
 _METRES_PER_STEP = 100 / 65535
 
 
@@ -33,7 +38,7 @@ def scene_names(root: Path) -> list[str]:
     path = Path(root) / SCENE_LIST
     if not path.is_file():
         raise UserError(f"{path}: no such file. It lists the HiRoom scenes and comes with the benchmark data.")
-    return [line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    return [line.strip() for line in read_text(path, advice=_AGAIN).splitlines() if line.strip()]
 
 
 def load_scene(root: Path, name: str) -> Scene:
@@ -88,9 +93,13 @@ def _read_pose(path: Path) -> np.ndarray:
 
 def _read_matrix(path: Path) -> np.ndarray:
     try:
+        if path.stat().st_size > _LARGEST_MATRIX:
+            raise ValueError("far too large")
         matrix = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError, SyntaxError, TokenError, MemoryError, EOFError) as error:
         raise FreeGeoError(f"{path}: not a readable matrix ({error}).") from error
+    if not isinstance(matrix, np.ndarray) or matrix.dtype.kind not in "fiu":
+        raise FreeGeoError(f"{path}: a matrix of numbers was expected.")
     if matrix.ndim != 2 or min(matrix.shape) < 3:
         raise FreeGeoError(f"{path}: a matrix was expected, not shape {matrix.shape}.")
     return matrix

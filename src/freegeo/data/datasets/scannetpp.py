@@ -112,9 +112,12 @@ def undistorted(camera: ColmapCamera) -> UndistortedCamera:
 
     k1, k2, p1, p2 = camera.params[4:8]
     distortion = (k1, k2, p1, p2, 0.0)
-    K, (x, y, valid_width, valid_height) = cv2.getOptimalNewCameraMatrix(
-        K_raw, np.array(distortion), (width, height), 1.0, (width, height)
-    )
+    try:
+        K, (x, y, valid_width, valid_height) = cv2.getOptimalNewCameraMatrix(
+            K_raw, np.array(distortion), (width, height), 1.0, (width, height)
+        )
+    except cv2.error as error:
+        raise FreeGeoError(f"Camera {camera.number} is none that OpenCV can undistort ({error.err}).") from None
     return UndistortedCamera(np.asarray(K, np.float64), K_raw, distortion, (x, y, valid_width, valid_height))
 
 
@@ -126,7 +129,10 @@ def valid_mask(truth: SceneTruth, index: int, size_hw: tuple[int, int]) -> np.nd
     if path is None:
         return None
     height, width = size_hw
-    depth = cv2.resize(read_depth(path, size_hw), (width, height), interpolation=cv2.INTER_LINEAR)
+    try:
+        depth = cv2.resize(read_depth(path, size_hw), (width, height), interpolation=cv2.INTER_LINEAR)
+    except cv2.error as error:
+        raise FreeGeoError(f"{path}: cannot be brought to {width} x {height} pixels ({error.err}).") from None
     return (depth > 0) & np.isfinite(depth)
 
 

@@ -10,8 +10,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from functools import partial
 from pathlib import Path
 
@@ -23,13 +21,18 @@ from freegeo.data.photos import MemoryPhoto
 from freegeo.data.procedural.domains import DOMAINS, get_domain
 from freegeo.data.procedural.photographs import photograph_room
 from freegeo.data.scene import Scene, SceneTruth
-from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import atomic_path, write_npz
+from freegeo.errors import DamagedError, UserError
+from freegeo.files import Kind, atomic_path, read_npz, write_npz
 from freegeo.geometry.depth import depth_to_world, valid_depth
 
 PREFIX = "procedural-"
 FRAMES = 16
 POINT_SPACING = 0.04
+_AGAIN = "Remove it; it is rendered again."
+_KINDS: dict[str, Kind] = {
+    "photos": ("u", (-1, -1, -1, 3)), "depth_z": ("f", (-1, -1, -1)), "T_cam_world": ("f", (-1, 4, 4)),
+    "K": ("f", (-1, 3, 3)),
+}  # fmt: skip
 CONSTANTS = DatasetConstants(
     voxel=0.04,
     truncation=0.16,
@@ -119,8 +122,7 @@ def write_points(path: Path, points: np.ndarray) -> None:
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            return {name: content[name] for name in ("photos", "depth_z", "T_cam_world", "K")}
-    except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError) as error:
-        raise FreeGeoError(f"{path}: damaged room ({error}). Remove it; it is rendered again.") from None
+    arrays = read_npz(path, _KINDS, advice=_AGAIN)
+    if len({value.shape[0] for value in arrays.values()}) != 1 or arrays["photos"].shape[:3] != arrays["depth_z"].shape:
+        raise DamagedError(path, "its photos, depth and cameras are not of the same views", _AGAIN)
+    return arrays

@@ -1,0 +1,59 @@
+"""Main memory that a process may use: what the machine has free, and what its control group leaves."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
+_UNLIMITED = 1 << 60
+"""Limits of a control group from here on mean that there is none."""
+
+
+def host_available() -> int:
+    """Bytes of main memory that are free or can be freed, within the limits of containers and batch systems."""
+    return max(0, min([_of_machine(), *_of_groups()]))
+
+
+def _of_machine() -> int:
+    for line in _text(PROC / "meminfo").splitlines():
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return 8 << 30
+
+
+def _of_groups() -> list[int]:
+    """Bytes that each control group of this process, and each one around it, leaves; empty where none has a limit."""
+    left = []
+    for line in _text(PROC / "self" / "cgroup").splitlines():
+        _, controllers, name = line.split(":", 2)
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        root = CGROUPS / "memory" if controllers else CGROUPS
+        group = root / name.strip("/")
+        # In a container the names are those outside of it; what is mounted there is the container's own group.
+        around = (group, *group.parents) if group.is_dir() else (root,)
+        left += [free for place in around if place.is_relative_to(root) and (free := _left(place)) is not None]
+    return left
+
+
+def _left(group: Path) -> int | None:
+    """Bytes below the limit of a control group, pages of files that can be dropped counted as free."""
+    for limit_file, used_file, cached in (
+        ("memory.max", "memory.current", "inactive_file"),
+        ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    ):
+        limit, used = _text(group / limit_file).strip(), _text(group / used_file).strip()
+        if limit.isdigit() and used.isdigit() and int(limit) < _UNLIMITED:
+            facts = dict(line.split(" ", 1) for line in _text(group / "memory.stat").splitlines() if " " in line)
+            return int(limit) - int(used) + int(facts.get(cached, 0))
+    return None
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""

@@ -1,0 +1,188 @@
+"""Files that lie about their size, are of the wrong kind, or cannot be written: one sentence each."""
+
+import errno
+import os
+import subprocess
+import sys
+import zipfile
+from io import BytesIO
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from freegeo import files, host
+from freegeo.cli.app import main, out_of_memory
+from freegeo.errors import DamagedError, FreeGeoError
+from freegeo.models import catalog
+
+FULL = Path("/dev/full")
+
+
+def npz(path, members):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(f"{name}.npy", content)
+    return path
+
+
+def npy(array) -> bytes:
+    out = BytesIO()
+    np.lib.format.write_array(out, array)
+    return out.getvalue()
+
+
+def header(shape, dtype="<f4") -> bytes:
+    out = BytesIO()
+    np.lib.format.write_array_header_1_0(out, {"descr": dtype, "fortran_order": False, "shape": shape})
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("shape", [(1 << 33,), (1 << 40, 1 << 40), (-1,)], ids=str)
+def test_an_array_larger_than_its_file_is_not_allocated(tmp_path, shape):
+    with pytest.raises(DamagedError, match="does not have the size that its header says"):
+        files.read_npz(npz(tmp_path / "a.npz", {"x": header(shape)}))
+
+
+def test_a_file_that_unpacks_to_more_than_the_free_memory_is_refused_by_its_headers(tmp_path, monkeypatch):
+    path = npz(tmp_path / "a.npz", {"x": npy(np.zeros((1000, 1000), np.float32)), "y": npy(np.ones(3))})
+    assert path.stat().st_size < 20_000
+    monkeypatch.setattr(files, "host_available", lambda: 3_900_000)
+    with pytest.raises(FreeGeoError, match=r"a\.npz: unpacks to 0\.0 GB, and 0\.0 GB of memory are free"):
+        files.read_npz(path)
+    assert files.read_npz(path, {"y": ("f", (-1,))})["y"].tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("array", "reason"),
+    [
+        (np.zeros((2, 3), np.int64), "x is int64 of"), (np.zeros(3, np.float32), r"x is float32 of the shape \(3,\)"),
+        (np.zeros((2, 4), np.float32), r"x is float32 of the shape \(2, 4\)"), (np.array([["a"]]), "x is <U1 of"),
+    ],
+    ids=["integers", "one axis", "four columns", "text"],
+)  # fmt: skip
+def test_arrays_of_another_kind_are_refused(tmp_path, array, reason):
+    with pytest.raises(DamagedError, match=reason):
+        files.read_npz(npz(tmp_path / "a.npz", {"x": npy(array)}), {"x": ("f", (-1, 3))})
+
+
+def test_json_is_checked_and_keeps_fields_that_nobody_named(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text('{"a": [1, 2], "more": {"b": null}}')
+    assert files.read_json(path, dict[str, object]) == {"a": [1, 2], "more": {"b": None}}
+    for text in ("[1", "1" * 5000, "[" * 100_000, '{"a": 1}', "\xff"):
+        path.write_bytes(text.encode("latin-1"))
+        with pytest.raises(DamagedError, match=r"a\.json: damaged file"):
+            files.read_json(path, dict[str, list[int]])
+
+
+def test_tensors_on_a_full_disk_end_as_other_files_do(tmp_path, monkeypatch):
+    import safetensors.torch
+
+    def full(*arguments, **options):
+        raise safetensors.SafetensorError("I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr(safetensors.torch, "save_file", full)
+    with pytest.raises(OSError) as caught:
+        files.write_tensors(tmp_path / "a.safetensors", {"x": torch.zeros(1)})
+    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(tmp_path / "a.safetensors"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_tensors_are_refused_whatever_the_reader_raises(tmp_path):
+    path = tmp_path / "a.safetensors"
+    save_file({"x": torch.zeros(2)}, path)
+    whole = path.read_bytes()
+    for content in (whole[:-1], whole[:20], b"", whole.replace(b'"F32"', b'"F31"'), b"\xff" * 8 + whole[8:]):
+        path.write_bytes(content)
+        with pytest.raises(DamagedError, match=r"a\.safetensors: damaged file"):
+            files.read_tensors(path)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_limits_of_control_groups_count(tmp_path, monkeypatch, version):
+    """A group of 3 GB with 2 GB used, 1 GB of that for files that can be dropped, in one with more room."""
+    root = tmp_path / "groups" / ("memory" if version == 1 else "")
+    names = {
+        1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+        2: ("memory.max", "memory.current", "inactive_file"),
+    }[version]
+    for group, limit in ((root / "job", 3_000), (root, 9_000)):
+        group.mkdir(parents=True, exist_ok=True)
+        (group / names[0]).write_text(f"{limit}\n")
+        (group / names[1]).write_text("2000\n")
+        (group / "memory.stat").write_text(f"cache 5\n{names[2]} 1000\n")
+    (tmp_path / "self").mkdir()
+    (tmp_path / "self" / "cgroup").write_text("4:memory:/job\n" if version == 1 else "0::/job\n")
+    (tmp_path / "meminfo").write_text("MemAvailable: 1000 kB\n")
+    monkeypatch.setattr(host, "PROC", tmp_path)
+    monkeypatch.setattr(host, "CGROUPS", tmp_path / "groups")
+    assert host.host_available() == 2_000
+    (root / "job" / names[0]).write_text("max\n")
+    assert host.host_available() == 8_000
+    (root / names[0]).write_text("9223372036854771712\n")
+    assert host.host_available() == 1_024_000
+
+
+def broken_plugin(monkeypatch, load):
+    point = SimpleNamespace(name="bad", value="bad:ENTRY", load=load)
+    monkeypatch.setattr(catalog, "_plugin_points", lambda: {"bad": point})
+
+
+def failing():
+    raise ImportError("no module\nnamed x")
+
+
+def test_a_plugin_that_does_not_load_hides_no_other_model(monkeypatch, capsys):
+    broken_plugin(monkeypatch, failing)
+    assert main(["models"]) == 0
+    streams = capsys.readouterr()
+    assert "freegeo-tiny" in streams.out and "da3-base" in streams.out
+    assert "warning: the plug-in 'bad' (bad:ENTRY) does not work (ImportError: no module named x)" in streams.err
+    assert main(["models", "describe", "bad"]) == 1
+    assert "freegeo: the plug-in 'bad'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "what"),
+    [
+        (MemoryError(), "of this machine"), (torch.OutOfMemoryError("CUDA out of memory. Tried"), "of the device"),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried"), "of this machine"),
+    ],
+    ids=["python", "device", "torch"],
+)  # fmt: skip
+def test_exhausted_memory_says_what_to_change(monkeypatch, capsys, error, what):
+    def fail(name):
+        raise error
+
+    monkeypatch.setattr(catalog, "entry", fail)
+    assert main(["models", "describe", "freegeo-tiny"]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"freegeo: the memory {what}") and "--model" in said and "--max-views" in said
+
+
+def test_other_errors_are_no_matter_of_memory():
+    assert out_of_memory(RuntimeError("shape mismatch")) is None
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"]], ids=" ".join)
+def test_output_that_nobody_reads_or_nothing_can_hold(arguments):
+    command = [sys.executable, "-m", "freegeo.cli.app", *arguments]
+    with FULL.open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "freegeo: standard output: No space left on device.\n")
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_code_of_a_mistake_is_kept_where_nothing_can_be_printed():
+    with FULL.open("w") as full:
+        done = subprocess.run([sys.executable, "-m", "freegeo.cli.app", "run"], stderr=full, check=False)
+    assert done.returncode == 2

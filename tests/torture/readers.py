@@ -1,0 +1,391 @@
+"""Everything that freegeo reads: how a file of a kind is written, and what is done with it."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import torch
+from PIL import Image
+
+from bench_tools import ROOMS, small_room, store_truth, task
+from exact_rooms import room
+from example_results import write_example
+from fixture_tools import fixture_path
+from freegeo import files
+from freegeo.adaptation.adapter_files import export_published, load_adapter, save_adapter
+from freegeo.adaptation.state import UNFINISHED_FILE, read_state, write_state
+from freegeo.benchmark.results import read_results
+from freegeo.benchmark.score import evaluate_all
+from freegeo.benchmark.stored import read_stored
+from freegeo.benchmark.tasks import DAMAGED
+from freegeo.cameras.reading import read_camera_file
+from freegeo.cli.app import checked_config, main
+from freegeo.data.datasets import registry
+from freegeo.data.photos import load_photos
+from freegeo.data.procedural import splits
+from freegeo.data.video import load_video
+from freegeo.errors import FreeGeoError
+from freegeo.evidence.matches import VERSION, load_matches
+from freegeo.export.formats import filter_reconstruction
+from freegeo.export.kept import load_kept, load_masks, save_kept
+from freegeo.export.measured import load_tracks, save_tracks
+from freegeo.fusion.tracks import Tracks
+from freegeo.models.checkpoints import fingerprint, load_weights, require_fit, save_weights
+from freegeo.models.da3_config import KEYS
+from freegeo.report.page import write_report
+from freegeo.run_folder import run_folder
+from tiny_models import tiny_da3, trained
+
+VIEWS, SIZE = 3, (12, 16)
+HIROOM = "20241230/828805/cam_sampled_06"
+DATASETS = fixture_path("benchmark", "datasets")
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A kind of file."""
+
+    name: str
+    write: Callable[[Path], Path]
+    """Make a sound file, and what belongs to it, in a new folder; returns the file's path."""
+    read: Callable[[Path], object]
+    """Read the file, and use what it says."""
+
+
+def _command(*arguments: object) -> None:
+    """Run a command; its sentence becomes an error, as a reader's."""
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as said:
+        code = main([str(argument) for argument in arguments])
+    if code:
+        raise FreeGeoError(said.getvalue().strip().splitlines()[-1])
+
+
+def _result(folder: Path) -> Path:
+    """Return a small finished result, with everything that belongs to one."""
+    scene = room(VIEWS, SIZE)
+    with run_folder(folder, {"command": "reconstruct"}) as run:
+        scene.save(folder)
+        filtered = filter_reconstruction(scene)
+        save_kept(folder, filtered, np.ones(scene.depth_z.shape, bool))
+        files.write_json(
+            folder / "reconstruction.json",
+            {"images": list(scene.names), "photo_files": [None] * VIEWS, "refinement": {}, "warnings": ["w"]},
+        )
+        run.finish()
+    return folder
+
+
+def _of_result(name: str) -> Callable[[Path], Path]:
+    return lambda folder: _result(folder) / name
+
+
+def _export(file: Path) -> None:
+    _command("export", file.parent, "-f", "ply,depth,nerfstudio", "-o", file.parent.parent / "exported")
+
+
+def _tracks(folder: Path) -> Path:
+    _result(folder)
+    return save_tracks(folder, Tracks(
+        xyz=np.ones((2, 3)), colours=np.zeros((2, 3), np.uint8), point=np.array([0, 0, 1, 1]),
+        view=np.array([0, 1, 0, 1]), pixel=np.ones((4, 2)),
+    ))  # fmt: skip
+
+
+def _matches(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    views, pairs = np.array([[0, 1], [0, 2]]), np.array([0, 1, 2])
+    np.savez(
+        folder / "matches.npz", format=VERSION, names=["a", "b", "c"], fingerprint="x", photo_hw=np.full((3, 2), 20),
+        match_hw=np.full((3, 2), 10), keypoints=np.ones((6, 2)), view_start=np.array([0, 2, 4, 6]), pairs=views,
+        pair_start=pairs, ends=np.array([[0, 2], [1, 4]]), flatness=np.zeros(2), tried=views,
+        outcome=np.zeros(2, int), candidates=np.ones(2, int),
+    )  # fmt: skip
+    return folder / "matches.npz"
+
+
+def _use_matches(file: Path) -> None:
+    found = load_matches(file)
+    if found is not None:
+        for view, (start, end) in enumerate(zip(found.view_start[:-1], found.view_start[1:], strict=True)):
+            assert len(found.keypoints[start:end]) == end - start, view
+        assert len(found.pair_start) == len(found.pairs) + 1
+        assert found.keypoints[found.ends].shape == (len(found.ends), 2, 2)
+        assert np.isfinite(found.keypoints).all()
+
+
+def _example(name: str) -> Callable[[Path], Path]:
+    return lambda folder: write_example(folder, views=2, hw=SIZE) / name
+
+
+def _report(file: Path) -> None:
+    folder = file if (file / "prediction.npz").is_file() else file.parent
+    folder = folder if (folder / "reconstruction.json").is_file() else folder.parent
+    write_report(folder)
+
+
+# The benchmark
+
+
+def _bench(name: str) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        one = task()
+        with mock.patch.object(splits, "photograph_room", small_room):
+            store_truth(folder / "data", folder / "out", one)
+        files.write_json(one.folder(folder / "out") / "scores.json", {"metrics": {"auc30": 0.5}, "failed": {}})
+        evaluate_all(folder / "data", folder / "out")
+        places = {
+            **{file: one.folder(folder / "out") / file for file in ("task.json", "scores.json", "prediction.npz")},
+            "results.jsonl": next((folder / "out").glob("*.jsonl")),
+            "room.npz": next((folder / "data").rglob(f"{ROOMS[0]}.npz")),
+        }  # fmt: skip
+        return places[name]
+
+    return write
+
+
+def _evaluate(file: Path) -> None:
+    folder = next(parent for parent in file.parents if (parent / "out").is_dir())
+    evaluate_all(folder / "data", folder / "out")
+
+
+def _stored(file: Path) -> None:
+    folder = next(parent for parent in file.parents if (parent / "out").is_dir())
+    stored = read_stored(task(), folder / "out")
+    assert stored.prediction.depth_z is not None
+
+
+def _room(file: Path) -> None:
+    scene = splits.load_room("test-id", file.parent, ROOMS[0])
+    scene.photos[0].read()
+
+
+# Models and adapters
+
+
+@cache
+def _tiny() -> torch.nn.Module:
+    return tiny_da3()
+
+
+def _weights(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    save_weights(_tiny(), folder / "model.safetensors", KEYS, {"config": "{}"})
+    return folder / "model.safetensors"
+
+
+def _weights_pt(folder: Path) -> Path:
+    from safetensors.torch import load_file
+
+    tensors = load_file(_weights(folder))
+    torch.save({"model": tensors, "epoch": 3}, folder / "model.pt")
+    return folder / "model.pt"
+
+
+def _index(folder: Path) -> Path:
+    from safetensors import safe_open
+
+    weights = _weights(folder)
+    with safe_open(weights, "pt") as file:
+        names = dict.fromkeys(file.keys(), weights.name)
+    files.write_json(folder / "model.safetensors.index.json", {"metadata": {}, "weight_map": names})
+    return folder / "model.safetensors.index.json"
+
+
+def _use_weights(file: Path) -> None:
+    model = _tiny()
+    require_fit(model, file, KEYS, "tiny")
+    load_weights(model, file, KEYS, "tiny")
+    fingerprint(file)
+
+
+def _adapter(name: str) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        adapter = trained(tiny_da3())
+        save_adapter(adapter, folder, {"loss_curve": []})
+        adapter.detach()
+        return folder / name
+
+    return write
+
+
+def _use_adapter(file: Path) -> None:
+    model = copy.deepcopy(_tiny())
+    folder = file.parent / "latest_lora_peft" if (file.parent / "latest_lora_peft").is_dir() else file.parent
+    load_adapter(model, folder).detach()
+
+
+def _published(name: str) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        adapter = trained(tiny_da3())
+        export_published(adapter, folder)
+        adapter.detach()
+        return folder / name
+
+    return write
+
+
+def _parts():
+    adapter = trained(copy.deepcopy(_tiny()))
+    optimiser = torch.optim.AdamW(adapter.parameters(), lr=1e-3)
+    for parameter in adapter.parameters():
+        parameter.requires_grad_(True)
+        parameter.grad = torch.ones_like(parameter)
+    optimiser.step()
+    return adapter, optimiser
+
+
+def _state(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    adapter, optimiser = _parts()
+    about = {"identity": "i", "next_step": 1, "seconds": 1.0, "curve": [{"total": 1.0}], "scaler": {}}
+    earlier = {0.25: {n: p.detach().clone() for n, p in adapter.named_parameters().items()}}
+    write_state(folder, adapter, optimiser, about, earlier=earlier)
+    return folder / UNFINISHED_FILE
+
+
+def _use_state(file: Path) -> None:
+    adapter, optimiser = _parts()
+    read_state(file.parent, adapter, optimiser, "i")
+    for parameter in adapter.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    optimiser.step()
+
+
+def _use_run(file: Path) -> None:
+    with run_folder(file.parent, {"command": "reconstruct"}) as run:
+        _ = run.finished, dict(run.notes)
+
+
+# Datasets, cameras, photos
+
+
+def _dataset(name: str, scene: str, place: str) -> Reader:
+    def write(folder: Path) -> Path:
+        shutil.copytree(DATASETS / name, folder / name)
+        return folder / name / place
+
+    def read(file: Path) -> None:
+        data = file
+        while data.name != name or not data.is_dir():
+            data = data.parent
+        try:
+            loaded = registry.load_scene(data.parent, name, scene)
+            truth = loaded.truth
+            assert truth is not None
+            photo = loaded.photos[0].read()
+            registry.valid_mask(truth, 0, photo.shape[:2])
+            registry.true_depth(loaded, (12, 16))
+            if place.endswith(".ply"):
+                from freegeo.fusion.mesh import read_mesh, read_points
+
+                (read_points if name == "hiroom" else read_mesh)(truth.surface)
+        except DAMAGED as error:
+            raise FreeGeoError(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
+
+    return Reader(f"{name} {Path(place).suffix[1:]} {Path(place).stem[:8]}", write, read)
+
+
+def _photo(suffix: str, **options: object) -> Reader:
+    def write(folder: Path) -> Path:
+        folder.mkdir(parents=True)
+        pixels = np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8)
+        image = Image.fromarray(pixels)
+        exif = image.getexif()
+        exif[0x0112] = 6
+        image.save(folder / f"photo{suffix}", exif=exif, **options)
+        return folder / f"photo{suffix}"
+
+    return Reader(f"photo {suffix}", write, lambda file: load_photos([file])[0].read())
+
+
+def _video(folder: Path) -> Path:
+    import av
+
+    folder.mkdir(parents=True)
+    with av.open(str(folder / "v.mp4"), "w") as out:
+        stream = out.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        rng = np.random.default_rng(0)
+        for _ in range(8):
+            pixels = rng.integers(0, 255, (6, 8, 3), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        out.mux(stream.encode())
+    return folder / "v.mp4"
+
+
+def _camera_file(name: str, content: str) -> Reader:
+    def write(folder: Path) -> Path:
+        folder.mkdir(parents=True)
+        (folder / name).write_text(content)
+        return folder / name
+
+    return Reader(f"cameras {name}", write, read_camera_file)
+
+
+MATRICES = [[[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]] for x in (0.0, 1.0)]
+TRANSFORMS = {
+    "w": 16, "h": 12, "fl_x": 10.0, "fl_y": 10.0, "cx": 8.0, "cy": 6.0, "camera_model": "OPENCV", "k1": 0.0,
+    "frames": [{"file_path": f"{n}.png", "transform_matrix": matrix} for n, matrix in zip("ab", MATRICES, strict=True)],
+}  # fmt: skip
+CONFIG = '[run]\nsources = ["photos"]\noutput = "out"\nformats = ["ply"]\nsteps = 50\nadapt = true\n'
+
+
+def _config(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    (folder / "config.toml").write_text(CONFIG)
+    return folder / "config.toml"
+
+
+READERS = (
+    Reader("prediction.npz", _of_result("prediction.npz"), _export),
+    Reader("kept.npz", _of_result("kept.npz"), lambda f: (load_kept(f.parent, (VIEWS, *SIZE)), load_masks(f.parent))),
+    Reader("tracks.npz", _tracks, lambda f: load_tracks(f.parent, VIEWS)),
+    Reader("matches.npz", _matches, _use_matches),
+    Reader("reconstruction.json", _of_result("reconstruction.json"), _export),
+    Reader("report prediction", _example("prediction.npz"), _report),
+    Reader("report summary", _example("reconstruction.json"), _report),
+    Reader("report scores", _example("scores.json"), _report),
+    Reader("report adapter", _example("adapter/freegeo.json"), _report),
+    Reader("run state", _of_result(files.RUN_FILE), _use_run),
+    Reader("bench task", _bench("task.json"), _evaluate),
+    Reader("bench scores", _bench("scores.json"), _evaluate),
+    Reader("bench prediction", _bench("prediction.npz"), _stored),
+    Reader("bench results", _bench("results.jsonl"), lambda f: read_results(f.parent)),
+    Reader("room.npz", _bench("room.npz"), _room),
+    Reader("weights", _weights, _use_weights),
+    Reader("weights.pt", _weights_pt, _use_weights),
+    Reader("weights index", _index, _use_weights),
+    Reader("adapter config", _adapter("adapter_config.json"), _use_adapter),
+    Reader("adapter weights", _adapter("adapter_model.safetensors"), _use_adapter),
+    Reader("adapter notes", _adapter("freegeo.json"), _use_adapter),
+    Reader("adapter token", _adapter("camera_token.safetensors"), _use_adapter),
+    Reader("published token", _published("latest_lora.pt"), _use_adapter),
+    Reader("published config", _published("latest_lora_peft/adapter_config.json"), lambda f: _use_adapter(f.parent)),
+    Reader("adapter state", _state, _use_state),
+    _dataset("eth3d", "delivery_area", "delivery_area/dslr_calibration_jpg/cameras.txt"),
+    _dataset("eth3d", "delivery_area", "delivery_area/dslr_calibration_jpg/images.txt"),
+    _dataset("eth3d", "delivery_area", "delivery_area/images/dslr_images/DSC_0690.JPG"),
+    _dataset("eth3d", "delivery_area", "delivery_area/masks_for_images/dslr_images/DSC_0690.png"),
+    _dataset("eth3d", "delivery_area", "delivery_area/combined_mesh.ply"),
+    _dataset("7scenes", "stairs", "7Scenes/stairs/seq-02/frame-000000.pose.txt"),
+    _dataset("7scenes", "stairs", "7Scenes/stairs/seq-02/frame-000000.depth.png"),
+    _dataset("hiroom", HIROOM, f"data/{HIROOM}/pose/0001.npy"),
+    _dataset("scannetpp", "1ada7a0617", "1ada7a0617/merge_dslr_iphone/colmap/sparse_render_rgb/cameras.bin"),
+    _dataset("scannetpp", "1ada7a0617", "1ada7a0617/merge_dslr_iphone/colmap/sparse_render_rgb/images.bin"),
+    _dataset("scannetpp", "1ada7a0617", "1ada7a0617/merge_dslr_iphone/render_depth/frame_000000.png"),
+    _camera_file("transforms.json", json.dumps(TRANSFORMS)),
+    _camera_file("tum.txt", "# t x y z q\n" + "".join(f"{t}.0 0 {t} 0 0 0 0 1\n" for t in range(3))),
+    Reader("config.toml", _config, checked_config),
+    _photo(".png"), _photo(".jpg"), _photo(".tif"), _photo(".webp"),
+    Reader("video", _video, lambda f: [frame.read() for frame in load_video(f, max_views=4)]),
+)  # fmt: skip
