@@ -116,7 +116,8 @@ def make_photos(folder: Path) -> None:
             Image.fromarray(pixels).save(folder / name / f"{k}.png")
 
 
-@pytest.mark.parametrize("commands", [LIGHT, pytest.param(HEAVY, marks=pytest.mark.slow)], ids=["light", "heavy"])
+@pytest.mark.slow
+@pytest.mark.parametrize("commands", [LIGHT, HEAVY], ids=["light", "heavy"])
 def test_commands_ask_the_network_for_nothing(tmp_path, commands):
     make_photos(tmp_path / "rooms")
     with socket.create_server(("127.0.0.1", 0)) as server:

@@ -392,6 +392,7 @@ def test_a_guard_that_reports_changes_nothing(model, judged):
     assert same(reported, tensors(plain))
 
 
+@pytest.mark.slow
 def test_states_on_the_way_outlive_a_stop(model, tmp_path, judged):
     def stop(progress):
         if progress.step == 2:

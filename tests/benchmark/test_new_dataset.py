@@ -80,6 +80,7 @@ def test_every_recipe_accepts_it(data, setup, name):
         predictor.recipe("toys")
 
 
+@pytest.mark.slow
 def test_a_run_scores_it_and_says_whose_settings_it_took(data, tiny_model, tmp_path, capsys):
     options = ["--scenes", "1", "--seeds", "43", "--views", "4", "--steps", "1", "--device", "cpu"]
     code = main(

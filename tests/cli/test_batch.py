@@ -317,6 +317,7 @@ def test_a_retry_does_not_overwrite_what_it_continues(freegeo, here, rooms, tiny
         assert ["--overwrite" in arguments for arguments in here[-1].commands] == [True, False]
 
 
+@pytest.mark.slow
 def test_a_saved_adapter_reconstructs_every_scene(freegeo, here, rooms, tiny, tmp_path):
     assert (
         freegeo(

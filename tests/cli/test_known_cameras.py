@@ -69,6 +69,7 @@ def test_run_returns_the_given_cameras_and_keeps_what_the_model_predicted(
     np.testing.assert_allclose(scaled.T_cam_world[:, :3, 3], result.T_cam_world[:, :3, 3] * factor, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_other_cameras_are_another_run_where_the_model_is_told_them(freegeo, photo_folder, tiny, file, known, tmp_path):
     out = tmp_path / "out"
     command = ["run", photo_folder, "-o", out, *tiny, *QUICK, *LITTLE, "--trust-cameras"]

@@ -98,6 +98,7 @@ def test_a_metric_model_gives_metres_frozen_and_adapted(freegeo, photo_folder, t
     assert "fits tiny-nested" in freegeo("models", "check", "tiny-nested", merged).out
 
 
+@pytest.mark.slow
 def test_cameras_of_rays_are_a_setting_of_the_folder(freegeo, photo_folder, tiny, tmp_path):
     by_rays, by_head = tmp_path / "rays", tmp_path / "head"
     assert freegeo("run", photo_folder, "-o", by_rays, *tiny, *OPTIONS, "--pose-from", "rays").code == 0

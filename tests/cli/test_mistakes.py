@@ -171,7 +171,7 @@ def test_default_model_offline_names_the_ways_out(freegeo, photo_folder, tmp_pat
     def unreachable(url, **options):
         raise OSError("no route")
 
-    monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", lambda *names: None)
+    monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", lambda *names, revision: None)
     monkeypatch.setattr(huggingface_hub, "get_hf_file_metadata", unreachable)
     outcome = freegeo("run", photo_folder, "-o", tmp_path / "out")
     assert outcome.code == 2

@@ -180,6 +180,7 @@ def test_steps_of_earlier_settings_do_not_stay_beside_a_refined_result(
     assert np.ptp(before) > 0
 
 
+@pytest.mark.slow
 def test_metres_of_a_measured_distance_are_said_to_be_moved_by_refinement(freegeo, result, tmp_path):
     shutil.copytree(result / "out", tmp_path / "out")
     found = Reconstruction.load(tmp_path / "out")

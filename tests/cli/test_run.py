@@ -238,6 +238,7 @@ def test_another_reference_view_keeps_the_adapter(freegeo, copy, photo_folder, t
     assert json.loads((copy / "reconstruction.json").read_text())["reference_view"] == "middle"
 
 
+@pytest.mark.slow
 def test_an_adapter_is_judged_again_by_predictions_of_another_reference_view(freegeo, photo_folder, tiny, tmp_path):
     command = ("run", photo_folder, "-o", tmp_path / "out", *tiny, *QUICK[:-1], "report", "--formats", "npz")
     assert freegeo(*command).code == 0

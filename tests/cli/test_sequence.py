@@ -222,6 +222,7 @@ def test_run_adapts_once_for_all_chunks(freegeo, walk, tiny, tmp_path):
     assert json.loads((out / "adapter/freegeo.json").read_text())["windows"] == [windows]
 
 
+@pytest.mark.slow
 def test_what_follows_an_adapter_that_is_not_used_is_predicted_by_the_frozen_model(
     freegeo, walk, tiny, tmp_path, monkeypatch
 ):
@@ -255,6 +256,7 @@ def test_chunks_with_known_cameras_stay_where_they_are(freegeo, walk, tiny, tmp_
     assert [chunk["piece"] for chunk in told(tmp_path / "out")["sequence"]["chunks"]] == [0] * COUNT
 
 
+@pytest.mark.slow
 def test_a_distance_in_one_piece_leaves_the_others_up_to_scale(freegeo, walk, tiny, tmp_path, oracle):
     oracle.change = lambda number, result: unlike(result) if number == 2 or number >= COUNT else result
     distance = "00.png:10,10 01.png:50,40 = 2"
@@ -346,6 +348,7 @@ def test_a_photo_alone_beyond_a_cut_is_a_piece(freegeo, walk, tiny, tmp_path, or
     assert open_reconstruction(tmp_path / "out/pieces/2").names == ("13.png",)
 
 
+@pytest.mark.slow
 def test_descriptors_belong_to_the_order_also_after_a_stop(freegeo, walk, tiny, tmp_path, oracle, monkeypatch):
     seen = []
 
@@ -366,6 +369,7 @@ def test_descriptors_belong_to_the_order_also_after_a_stop(freegeo, walk, tiny, 
         np.testing.assert_array_equal(content["descriptors"][order], seen[1])
 
 
+@pytest.mark.slow
 def test_chunks_that_were_removed_are_refined_again(freegeo, walk, tiny, tmp_path, oracle, monkeypatch):
     refined = []
 

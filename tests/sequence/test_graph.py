@@ -127,6 +127,7 @@ def test_a_loop_chunk_with_one_false_end_joins_at_the_other():
     assert placed.pieces == [list(range(CHUNKS))]
 
 
+@pytest.mark.slow
 def test_the_order_of_edges_does_not_matter():
     world = walk()
     edges = [*chain(world), edge(world, 0, 11, NONE, robust=True), edge(world, 3, 9, 0.5 * FALSE, robust=True)]
