@@ -52,7 +52,7 @@ from freegeo.pipeline import capital, judge_by_photos
 from freegeo.posed import doubt_focal_length, with_one_camera
 from freegeo.report.page import write_report
 from freegeo.run_folder import Part
-from freegeo.sequence.assembly import Assembly, Seams, assemble, broken, seams_between
+from freegeo.sequence.assembly import CONTRADICTED, Assembly, Seams, assemble, broken, seams_between
 from freegeo.sequence.chunks import Chunk, bridge, plan_chunks, runs
 from freegeo.sequence.cuts import Jumps, find_cuts
 from freegeo.sequence.join import Joined, Member
@@ -141,6 +141,7 @@ class SequenceJob(Job):
             )  # fmt: skip
         load = [partial(self._reader(names), k) for k in range(len(names))]
         pieces = [[Member(chunk=parts[k], sim3=found.sim3[k], load=load[k]) for k in piece] for piece in found.pieces]
+        loops = self._held(found, loops)
         told = self._told_of(chunks, numbers, found, loops, pieces)
         return self._write(pieces, told, adaptation)
 
@@ -323,6 +324,16 @@ class SequenceJob(Job):
                 else:
                     loops[number] = replace(loop, reason=reason)
         return loops, tied
+
+    def _held(self, found: Assembly, loops: list[Loop]) -> list[Loop]:
+        """Return the loops, with the reason where they contradict what is known of the places of chunks."""
+        if not any(joint.reason == CONTRADICTED for joint in found.joints):
+            return loops
+        self._warn(
+            "Places that the photos come back to, as matches say, contradict each other or the way between them: places "
+            "that look alike deceive matches. No loop is closed."
+        )
+        return [replace(loop, reason=loop.reason or CONTRADICTED) for loop in loops]
 
     def _refuted(self, chunk: Chunk, loop: Loop) -> str | None:
         """Predict the frames around both ends of a loop together; returns why that cannot be used."""

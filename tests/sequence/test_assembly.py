@@ -11,7 +11,7 @@ from exact_rooms import room
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.geometry.se3 import camera_centres
 from freegeo.geometry.sim3 import Sim3
-from freegeo.sequence.assembly import assemble, broken, seams_between
+from freegeo.sequence.assembly import CONTRADICTED, assemble, broken, seams_between
 from freegeo.sequence.chunks import Chunk, bridge, plan_chunks
 from sequence.test_join import part_of, similarity
 
@@ -122,3 +122,21 @@ def test_placed_chunks_whose_surfaces_are_apart_are_doubted(whole):
     parts = [part_of(whole, chunk, Sim3.identity()) for chunk in chunks]
     found = assemble(chunks, seams_between(chunks, parts.__getitem__), parts.__getitem__, placed=True)
     assert all(joint.as_dict()["reason"] is None for joint in found.joints)
+
+
+def test_loops_that_contradict_each_other_or_the_chain_are_all_left_out(whole):
+    chunks = plan_chunks(FRAMES, 4, 2)
+    true = Chunk(frames=(0, 1, 12, 13), tie="loop")
+    parts = [part_of(whole, chunk, similarity(number)) for number, chunk in enumerate([*chunks, true, true])]
+    alone, _ = put_together(whole, [*chunks, true])
+    assert all(joint.reason is None for joint in alone.joints)
+    # The second one takes its two places for one.
+    T = parts[-1].cameras()[0].copy()
+    T[2:] = T[2:] @ np.linalg.inv(T[2]) @ T[0]
+    parts[-1] = replace(parts[-1], T_cam_world=T)
+    both = [*chunks, true, replace(true)]
+    found = assemble(both, seams_between(both, parts.__getitem__), parts.__getitem__)
+    reasons = {joint.reason for joint in found.joints if joint.kind == "loop"}
+    assert reasons == {CONTRADICTED}
+    assert all(joint.reason is None for joint in found.joints if joint.kind != "loop")
+    assert found.pieces == [list(range(len(chunks)))]

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from freegeo.errors import DamagedError, UserError
-from freegeo.files import damaged_tensors, fitted, inside, read_json, write_tensors
+from freegeo.files import NAME_MAX, damaged_tensors, fitted, inside, read_json, write_tensors
 from freegeo.models.spec import KeyRules
 
 logger = logging.getLogger(__name__)
@@ -112,7 +112,8 @@ def parts_of(path: Path) -> dict[Path, list[str] | None]:
     parts: dict[Path, list[str] | None] = {}
     for file in sorted(set(names.values())):
         if Path(file).name != file or fitted(file) != file or not inside(path.parent, file).is_file():
-            raise UserError(f"{path.parent / file}: this part of the checkpoint is missing. Download it too.")
+            shown = file if len(file) <= NAME_MAX else f"{file[:80]}..."
+            raise UserError(f"{path.parent / shown}: this part of the checkpoint is missing. Download it too.")
         parts[path.parent / file] = [name for name, place in names.items() if place == file]
     return parts
 

@@ -19,6 +19,7 @@ Kind = Literal["neighbours", "bridge", "loop"]
 Load = Callable[[int], Depths]
 Seams = Mapping[tuple[int, int], Seam]
 """By the numbers of two chunks, the smaller first."""
+CONTRADICTED = "loops contradict each other or the seams between neighbours, so that none of them is used."
 _OPEN = 4
 """Chunks that are held in memory."""
 
@@ -127,11 +128,16 @@ def assemble(
     good = [pair for pair, seam in seams.items() if seam.reason is None]
     edges = [Edge.of(a, b, seams[a, b], robust=_kind(chunks, a, b) == "loop") for a, b in good]
     found = place(len(chunks), edges, fixed_scale=fixed_scale)
-    trust = dict(zip(good, found.trust, strict=True))
+    loops = {pair for pair in good if _kind(chunks, *pair) == "loop"}
+    # Which one is wrong cannot be told: of places that look alike several may agree, against a true loop.
+    contradicted = any(trust == 0 for trust in found.trust)
+    if contradicted:
+        edges = [edge for pair, edge in zip(good, edges, strict=True) if pair not in loops]
+        found = place(len(chunks), edges, fixed_scale=fixed_scale)
     of = {number: k for k, piece in enumerate(found.pieces) for number in piece}
     joints = []
     for (a, b), seam in seams.items():
-        reason = "it contradicts the other seams." if seam.reason is None and trust[a, b] == 0 else seam.reason
+        reason = CONTRADICTED if contradicted and (a, b) in loops else seam.reason
         distance = apart(a, b, found.sim3) if of[a] == of[b] else None
         joints.append(
             Joint(first=a, second=b, kind=_kind(chunks, a, b), seam=seam, gap=distance, reason=reason)

@@ -28,7 +28,7 @@ MUTUAL = 3
 """Each frame of a candidate is among so many far frames that are most like the other."""
 FEWEST_PAIRS = 2
 """Each of the two frames must have verified matches with so many of the three around the other one."""
-LEAST_SHARE = 0.8
+LEAST_SHARE = 0.9
 """Share of keypoints that match across a loop, over that of neighbours at one end which are about as alike."""
 LARGEST_RATIO, ALWAYS_GOOD_PX = 2.0, 2.0
 """The epipolar error across a loop may be so many times that at its ends, and always so many matching pixels."""
