@@ -330,8 +330,8 @@ class SequenceJob(Job):
         if not any(joint.reason == CONTRADICTED for joint in found.joints):
             return loops
         self._warn(
-            "Places that the photos come back to, as matches say, contradict each other or the way between them: places "
-            "that look alike deceive matches. No loop is closed."
+            "Places that the photos come back to, as matches say, contradict each other or the way between them: "
+            "places that look alike deceive matches. No loop is closed."
         )
         return [replace(loop, reason=loop.reason or CONTRADICTED) for loop in loops]
 
