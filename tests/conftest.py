@@ -1,6 +1,7 @@
 """Settings of all tests."""
 
 import logging
+import signal
 
 import pytest
 import torch
@@ -11,6 +12,10 @@ import offline
 # The same examples in every run: a suite that fails once in a while says nothing about a change.
 settings.register_profile("repeatable", derandomize=True)
 settings.load_profile("repeatable")
+
+# A shell that starts the suite in the background lets it ignore Ctrl-C, which some tests press.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 offline.watch(lambda text: pytest.fail(f"a test {text}"))
