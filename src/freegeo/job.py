@@ -228,7 +228,7 @@ class Job:
             frozen = self.frozen()
             rejected, verdict = self._trained(self.recipe, frozen)
             final = frozen
-            if rejected is None and not (verdict and self.guard == "select" and verdict["outcome"] != "adapted"):
+            if self._may_use(rejected, verdict):
                 final, rejected = self._adapted_prediction(frozen)
         if rejected is not None:
             self._warn(f"{capital(rejected)} The result is that of the frozen model.")
@@ -237,6 +237,10 @@ class Job:
         return Computed(
             result=result, about=about, adaptation=Adaptation(used=used, rejected=rejected, verdict=verdict)
         )
+
+    def _may_use(self, rejected: str | None, verdict: Mapping[str, Any] | None) -> bool:
+        """Whether a trained adapter makes the result, after what `_trained` returned."""
+        return rejected is None and not (verdict and self.guard == "select" and verdict["outcome"] != "adapted")
 
     def frozen(self) -> Reconstruction:
         """Predict with the frozen model before an adaptation, or read what is there already."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
@@ -69,6 +69,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+Made = TypeVar("Made")
 CHUNKS_FOLDER = "chunks"
 PIECES_FOLDER = "pieces"
 DESCRIPTORS_NAME = f"{CHUNKS_FOLDER}/descriptors.npz"
@@ -241,7 +242,7 @@ class SequenceJob(Job):
         if not self.usable:
             return Adaptation()
         rejected, verdict = self._trained(self.recipe, None)
-        used = rejected is None and not (verdict and self.guard == "select" and verdict["outcome"] != "adapted")
+        used = self._may_use(rejected, verdict)
         if rejected is not None:
             self._warn(f"{capital(rejected)} The result is that of the frozen model.")
         if not used and self._attached is not None:
@@ -299,13 +300,10 @@ class SequenceJob(Job):
         """Do something with a chunk; go on without it, and say so, when there is no usable prediction of it."""
         if number in self.failed:
             return
-        try:
-            work(self._job(chunks[number], number, len(chunks)))
-        except (UserError, LostFolderError):
-            raise
-        except FreeGeoError as error:
-            self.failed[number] = str(error)
-            self._warn(f"Chunk {number} (frames {chunks[number]}) is left out: {error}")
+        _, reason = _tried(work, self._job(chunks[number], number, len(chunks)))
+        if reason is not None:
+            self.failed[number] = reason
+            self._warn(f"Chunk {number} (frames {chunks[number]}) is left out: {reason}")
 
     def _loops(self) -> tuple[list[Loop], list[Chunk]]:
         """Look for places that the sequence comes back to: what was found, and a chunk for each one that holds."""
@@ -338,28 +336,22 @@ class SequenceJob(Job):
     def _refuted(self, chunk: Chunk, loop: Loop) -> str | None:
         """Predict the frames around both ends of a loop together; returns why that cannot be used."""
         assert self.photos is not None
-        try:
-            found = self._job(chunk).make().result
-        except (UserError, LostFolderError):
-            raise
-        except FreeGeoError as error:
-            return str(error)
+        made, reason = _tried(ChunkJob.make, self._job(chunk))
+        if made is None:
+            return reason
         matches = find_matches([self.photos[frame] for frame in loop.frames])
-        return agrees(Candidate.of(found, str(self.compute.device)), chunk.frames, loop, matches).reason
+        return agrees(Candidate.of(made.result, str(self.compute.device)), chunk.frames, loop, matches).reason
 
     def _bridges(self, parts: Sequence[Chunk], seams: Seams) -> list[Chunk]:
         """Predict the frames around each seam that does not hold together, which may tie its chunks."""
         found = []
         for a, b in broken(parts, seams):
             tie = bridge(parts[a], parts[b], self.plan.size)
-            try:
-                self._job(tie).make()
-            except (UserError, LostFolderError):
-                raise
-            except FreeGeoError as error:
-                logger.info("no bridge over frames %s: %s", tie, error)
-            else:
+            _, reason = _tried(ChunkJob.make, self._job(tie))
+            if reason is None:
                 found.append(tie)
+            else:
+                logger.info("no bridge over frames %s: %s", tie, reason)
         return found
 
     def _seams(self, parts: Sequence[Chunk], names: Sequence[str], known: Seams | None = None) -> Seams:
@@ -568,6 +560,16 @@ class SequenceJob(Job):
             for name, value in (item for one in own for item in one.get("seconds", {}).items()):
                 total[name] = round(total.get(name, 0.0) + value, 2)
         return total
+
+
+def _tried(work: Callable[[ChunkJob], Made], job: ChunkJob) -> tuple[Made | None, str | None]:
+    """Return what a chunk's job makes, or why there is no usable prediction; other errors end the run."""
+    try:
+        return work(job), None
+    except (UserError, LostFolderError):
+        raise
+    except FreeGeoError as error:
+        return None, str(error)
 
 
 def _chunk_name(number: int) -> str:

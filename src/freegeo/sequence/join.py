@@ -13,6 +13,7 @@ import torch
 from freegeo.geometry.rotation import mean_rotation
 from freegeo.geometry.se3 import camera_centres, from_Rt
 from freegeo.geometry.sim3 import Sim3
+from freegeo.sequence.alignment import Depths
 from freegeo.sequence.chunks import Chunk
 
 SAME_SURFACE = 0.1
@@ -22,40 +23,12 @@ _OPEN = 3
 """Chunks that are held in memory: a frame is in two of them, or three where they overlap by more than half."""
 
 
-class ChunkResult(Protocol):
+class ChunkResult(Depths, Protocol):
     """What is joined of a chunk; `freegeo.export.reconstruction.Reconstruction` has it."""
-
-    @property
-    def depth_z(self) -> np.ndarray:
-        """(S, H, W)."""
-        ...
-
-    @property
-    def conf(self) -> np.ndarray:
-        """(S, H, W)."""
-        ...
-
-    @property
-    def images(self) -> np.ndarray:
-        """(S, H, W, 3) uint8."""
-        ...
 
     @property
     def scale(self) -> Any:
         """What lengths being metres rests on, or None."""
-        ...
-
-    @property
-    def sky(self) -> np.ndarray | None:
-        """(S, H, W), or None."""
-        ...
-
-    def cameras(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return `T_cam_world` (S, 4, 4) and `K` (S, 3, 3)."""
-        ...
-
-    def valid_pixels(self) -> np.ndarray:
-        """Mask (S, H, W) bool of usable depth."""
         ...
 
 
