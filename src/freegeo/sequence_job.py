@@ -143,8 +143,8 @@ class SequenceJob(Job):
         load = [partial(self._reader(names), k) for k in range(len(names))]
         pieces = [[Member(chunk=parts[k], sim3=found.sim3[k], load=load[k]) for k in piece] for piece in found.pieces]
         loops = self._held(found, loops)
-        told = self._told_of(chunks, numbers, found, loops, pieces)
-        return self._write(pieces, told, adaptation)
+        told = self._told_of(chunks, numbers, found, loops)
+        return self._write(list(zip(pieces, found.frames, strict=True)), told, adaptation)
 
     # -- before the chunks
 
@@ -371,15 +371,13 @@ class SequenceJob(Job):
     # -- the result
 
     def _told_of(
-        self, chunks: Sequence[Chunk], numbers: Sequence[int], found: Assembly, loops: Sequence[Loop],
-        pieces: Sequence[Sequence[Member]],
-    ) -> dict[str, Any]:  # fmt: skip
+        self, chunks: Sequence[Chunk], numbers: Sequence[int], found: Assembly, loops: Sequence[Loop]
+    ) -> dict[str, Any]:
         """Return what reconstruction.json says of the sequence."""
         piece_of = {numbers[k]: number for number, piece in enumerate(found.pieces) for k in piece}
         # Chunks that are left out have no seams, and those that tie others are numbered after all others.
         number_of = [*numbers, *range(len(chunks), len(chunks) + len(found.sim3) - len(numbers))]
         refined = self.folder.notes.get("refinement") or {}
-        frames = _frames_of(pieces)
         return {
             "frames": len(self.batch), "order": self.order, "chunk": self.plan.size, "overlap": self.plan.overlap,
             "chunks": [
@@ -402,14 +400,14 @@ class SequenceJob(Job):
             ],
             "pieces": [
                 {"folder": _piece_folder(k), "first": own[0], "last": own[-1], "frames": len(own)}
-                for k, own in enumerate(frames)
+                for k, own in enumerate(found.frames)
             ],
         }  # fmt: skip
 
     def _write(
-        self, pieces: Sequence[Sequence[Member]], told: dict[str, Any], adaptation: Adaptation
+        self, pieces: Sequence[tuple[Sequence[Member], Sequence[int]]], told: dict[str, Any], adaptation: Adaptation
     ) -> dict[str, Any]:
-        """Join each piece and write its files; the first one is the result, with what is said of the whole."""
+        """Join each piece (chunks and frames) and write its files; the first is the result, and tells of the whole."""
         parts, missing = told["pieces"], len(self.batch) - sum(part["frames"] for part in told["pieces"])
         if len(parts) > 1:
             others = some_of([f"{self._span(part)} in {part['folder']}" for part in parts[1:]])
@@ -428,7 +426,7 @@ class SequenceJob(Job):
         if missing:
             self._warn(f"{missing} of {len(self.batch)} photos are in no chunk that could be predicted.")
         summary: dict[str, Any] = {}
-        for number, (members, frames) in reversed(list(enumerate(zip(pieces, _frames_of(pieces), strict=True)))):
+        for number, (members, frames) in reversed(list(enumerate(pieces))):
             summary = self._write_piece(number, members, frames, told, adaptation)
         self.after(self)
         self.folder.finish()
@@ -583,17 +581,6 @@ def _tie_name(chunk: Chunk) -> str:
 def _piece_folder(number: int) -> str:
     """Where a piece is, below the output folder; the first one is the result itself."""
     return "." if number == 0 else f"{PIECES_FOLDER}/{number + 1}"
-
-
-def _frames_of(pieces: Sequence[Sequence[Member]]) -> list[list[int]]:
-    """Return the frames of each piece; one that two pieces have is in the first of them only."""
-    taken: set[int] = set()
-    found = []
-    for members in pieces:
-        own = sorted({frame for member in members for frame in member.chunk.frames} - taken)
-        taken.update(own)
-        found.append(own)
-    return found
 
 
 def _common_scale(members: Sequence[Member]) -> Scale | None:

@@ -63,8 +63,10 @@ class Assembly:
     sim3: list[Sim3]
     """Of each chunk: from its own frame to that of its piece."""
     pieces: list[list[int]]
-    """Chunks by their numbers, without those of loops; the piece with most frames first. A frame of several pieces
-    belongs to the first of them, and a piece without a frame of its own is none."""
+    """Chunks by their numbers, without those of loops; the piece with most frames first."""
+    frames: list[list[int]]
+    """Of each piece, ascending. A frame of several pieces belongs to the first of them, and a piece without a frame of
+    its own is none."""
 
 
 def seams_between(
@@ -124,7 +126,7 @@ def assemble(
             for (a, b), seam in seams.items()
         ]
         pieces = [[number for number, chunk in enumerate(chunks) if chunk.tie is None]]
-        return Assembly(joints=joints, sim3=same, pieces=pieces)
+        return Assembly(joints=joints, sim3=same, pieces=pieces, frames=_own_frames(chunks, pieces))
     good = [pair for pair, seam in seams.items() if seam.reason is None]
     edges = [Edge.of(a, b, seams[a, b], robust=_kind(chunks, a, b) == "loop") for a, b in good]
     found = place(len(chunks), edges, fixed_scale=fixed_scale)
@@ -143,18 +145,22 @@ def assemble(
             Joint(first=a, second=b, kind=_kind(chunks, a, b), seam=seam, gap=distance, reason=reason)
         )  # fmt: skip
     pieces = [[number for number in piece if chunks[number].tie is None] for piece in found.pieces]
-    return Assembly(joints=joints, sim3=found.sim3, pieces=_largest_first(chunks, pieces))
+    pieces.sort(key=lambda piece: (-len({frame for number in piece for frame in chunks[number].frames}), piece))
+    frames = _own_frames(chunks, pieces)
+    return Assembly(
+        joints=joints, sim3=found.sim3, pieces=[piece for piece, own in zip(pieces, frames, strict=True) if own],
+        frames=[own for own in frames if own],
+    )  # fmt: skip
 
 
-def _largest_first(chunks: Sequence[Chunk], pieces: Sequence[Sequence[int]]) -> list[list[int]]:
-    """Sort pieces by their numbers of frames; those whose frames larger ones have, all of them, are left out."""
-    frames = [{frame for number in piece for frame in chunks[number].frames} for piece in pieces]
+def _own_frames(chunks: Sequence[Chunk], pieces: Sequence[Sequence[int]]) -> list[list[int]]:
+    """Return the frames of each piece that no piece before it has, ascending."""
     taken: set[int] = set()
     found = []
-    for k in sorted(range(len(pieces)), key=lambda k: (-len(frames[k]), pieces[k])):
-        if frames[k] - taken:
-            found.append(list(pieces[k]))
-            taken |= frames[k]
+    for piece in pieces:
+        own = {frame for number in piece for frame in chunks[number].frames} - taken
+        taken |= own
+        found.append(sorted(own))
     return found
 
 
