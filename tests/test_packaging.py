@@ -11,6 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 TOOLS = {"pytest", "pytest-xdist", "hypothesis", "playwright", "ruff", "ty"}
+TOOLS |= {"nbclient", "ipykernel", "mkdocs-material", "mkdocstrings-python"}
 
 
 def packages(extra: str) -> set[str]:
@@ -23,12 +24,12 @@ def packages(extra: str) -> set[str]:
 
 
 def test_users_get_everything_but_the_tools():
-    assert packages("all") == {"viser", "pycolmap", "pillow-heif", "ray"}
+    assert packages("all") == {"viser", "pycolmap", "pillow-heif", "ray", "gradio"}
     assert packages("all") & TOOLS == set()
 
 
 def test_developers_get_everything():
-    assert packages("dev") == packages("all") | TOOLS
+    assert packages("dev") == packages("all") | packages("rerun") | TOOLS
 
 
 def pins(file: str) -> dict[str, str]:

@@ -22,6 +22,8 @@ ALLOWED = {
 NAMED = {
     "certifi": "MPL-2.0: changed files of it must stay open; a list of certificates",
     "hypothesis": "MPL-2.0: changed files of it must stay open; for tests only",
+    "orjson": "MPL-2.0 in part: changed files of it must stay open; JSON for the web app",
+    "pathspec": "MPL-2.0: changed files of it must stay open; for the documentation site only",
     "tqdm": "MPL-2.0 in part: changed files of it must stay open; progress bars of the hub's client",
 }
 """Packages with another licence than the allowed ones, and what it asks for."""
