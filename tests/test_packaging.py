@@ -24,7 +24,7 @@ def packages(extra: str) -> set[str]:
 
 
 def test_users_get_everything_but_the_tools():
-    assert packages("all") == {"viser", "pycolmap", "pillow-heif", "ray", "gradio"}
+    assert packages("all") == {"viser", "pycolmap", "pillow-heif", "ray", "gradio", "OpenEXR"}
     assert packages("all") & TOOLS == set()
 
 
