@@ -22,6 +22,7 @@ ALLOWED = {
 NAMED = {
     "certifi": "MPL-2.0: changed files of it must stay open; a list of certificates",
     "hypothesis": "MPL-2.0: changed files of it must stay open; for tests only",
+    "openexr": "BSD-3-Clause, which only its text of the licence says and not its metadata",
     "orjson": "MPL-2.0 in part: changed files of it must stay open; JSON for the web app",
     "pathspec": "MPL-2.0: changed files of it must stay open; for the documentation site only",
     "tqdm": "MPL-2.0 in part: changed files of it must stay open; progress bars of the hub's client",
