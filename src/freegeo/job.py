@@ -408,7 +408,7 @@ class Job:
                 found = refine_by_photos(
                     placed, self.photos, frozen=None if is_frozen else frozen, store=self.folder / MATCHES_NAME,
                     device=str(self.compute.device),
-                    again=partial(self._told, is_frozen=is_frozen) if self.spec.takes == "cameras" else None,
+                    again=partial(self._told, is_frozen=is_frozen) if self.spec.takes != "nothing" else None,
                 )  # fmt: skip
                 if found.tracks is not None:
                     if placed is not frozen:

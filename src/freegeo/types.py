@@ -155,7 +155,8 @@ class Features:
     """What the decoder reads: per layer the patch tokens and the special tokens of every view, in input order."""
 
     levels: Mapping[int, tuple[Tensor, Tensor]]
-    """layer -> (patch (B, S, P, C), special (B, S, T, C)); special[..., 0, :] is the camera token."""
+    """layer -> (patch (B, S, P, C), special (B, S, T, C)); special[..., 0, :] is the camera token. A model without one
+    returns no special tokens (T = 0) at the layers that losses compare, and names its levels by any integers."""
     image_hw: tuple[int, int]
     grid_hw: tuple[int, int]
     extra: Mapping[str, Tensor] = field(default_factory=dict)

@@ -300,8 +300,7 @@ def shape_of(model: ReconstructionModel) -> Shape:
         ),
         parameters=sum(p.numel() for name, p in model.named_parameters() if ".lora_" not in name),
         adapted_parameters=sum(linear.weight.numel() for linear in linears),
-        # Both families concatenate the outputs of two blocks.
-        channels=2 * width,
+        channels=part.feature_channels or 2 * width,
         special=part.spec.special_tokens,
         feature_copies=part.feature_copies,
     )

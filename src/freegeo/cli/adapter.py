@@ -11,6 +11,7 @@ from freegeo.cli import console
 from freegeo.cli.jobs import adapter_identity
 from freegeo.cli.options import model_of_adapter
 from freegeo.errors import UserError
+from freegeo.models.spec import NO_REFERENCE
 
 app = App(name="adapter", help="Fold a saved adapter into the weights of its model.", help_format="plaintext")
 SUFFIX = ".safetensors"
@@ -69,5 +70,5 @@ def merge(
     save_weights(loaded, output, catalog.entry(name).keys, about)
     console.say(f"{output}: {console.size(output)}, fingerprint {fingerprint(output)}")
     console.say(f"licence of the weights: {spec.weights_licence}")
-    reference = "" if spec.reference == "first" else " --reference first"
+    reference = "" if spec.reference in ("first", NO_REFERENCE) else " --reference first"
     console.say(f"use it: freegeo reconstruct PHOTOS -o OUT --model {name} --checkpoint {output}{reference}")

@@ -131,7 +131,8 @@ def describe(model: str) -> None:
     console.say(
         f"reference view: {spec.reference}; features compared at layers {', '.join(map(str, spec.loss_layers))}"
     )
-    console.say(f"adapter: {len(built.adapter_targets())} linear layers and the camera token")
+    token = "" if built.camera_token_name is None else " and the camera token"
+    console.say(f"adapter: {len(built.adapter_targets())} linear layers{token}")
     console.say(
         console.table(("rank", "trainable parameters"), [(str(r), f"{count_trainable(built, r):,}") for r in RANKS])
     )

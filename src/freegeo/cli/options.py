@@ -88,13 +88,17 @@ class ModelOptions:
     def build_empty(self) -> ReconstructionModel:
         """Build the model without weights, which reads photos and knows its properties; checks the options first."""
         from freegeo.models.catalog import build_empty
-        from freegeo.models.reference import require_rule
+        from freegeo.models.reference import require_no_choice, require_rule
+        from freegeo.models.spec import NO_REFERENCE
 
         self.compute()
         require_seed(self.seed)
         if self.reference is not None:
             require_rule(self.reference)
-        return build_empty(self.name)
+        model = build_empty(self.name)
+        if self.reference is not None and model.spec.reference == NO_REFERENCE:
+            require_no_choice(self.reference, model.spec.name)
+        return model
 
     def weights(self) -> Path:
         """Return the weight file, which is downloaded where needed."""

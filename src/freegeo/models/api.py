@@ -32,6 +32,8 @@ class ReconstructionModel(nn.Module, ABC):
 
     feature_copies: int = 1
     """Copies of all features that `aggregate` makes, such as normalised ones; the memory planner counts them."""
+    feature_channels: int | None = None
+    """Channels of the features at `spec.loss_layers`; None: twice the width, where two blocks' outputs are joined."""
 
     @abstractmethod
     def preprocess(self, photos: Sequence[PhotoLike], *, mixed: Mixed = MIXED) -> ImageBatch:

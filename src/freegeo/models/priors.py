@@ -12,11 +12,11 @@ __all__ = ["require_usable", "unusable", "usable"]
 def unusable(priors: Priors, spec: ModelSpec) -> str | None:
     """Say in one sentence why a model cannot take priors; None where it can.
 
-    Models of today take whole cameras or nothing: depth alone, or intrinsics alone, have no effect on any of them.
+    A model that takes whole cameras has no use for depth alone, or for intrinsics alone.
     """
     if spec.takes == "nothing":
         return f"{spec.name} takes no cameras: it sees the photos alone."
-    if priors.whole_cameras:
+    if spec.takes == "parts" or priors.whole_cameras:
         return None
     known = [part for part, value in (("poses", priors.T_cam_world), ("intrinsics", priors.K)) if value is not None]
     part = f"{known[0]} alone are" if len(known) == 1 else "only a part of them is"

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from freegeo.errors import UserError
+from freegeo.models.spec import NO_REFERENCE
 
 SMALLEST_SELECTION = 3
 """With fewer views than this the first one is the reference, whatever the rule."""
@@ -60,6 +61,12 @@ def require_rule(rule: str) -> None:
     """Raise UserError when there is no such rule."""
     if rule not in RULES:
         raise UserError(f"unknown reference-view rule '{rule}': choose one of {', '.join(RULES)}.")
+
+
+def require_no_choice(rule: str, model: str) -> None:
+    """Raise UserError when a rule asks a model without reference view, or with the first one, for another view."""
+    if rule not in ("first", NO_REFERENCE):
+        raise UserError(f"{model} treats all views alike, so there is no reference view to choose. Leave '{rule}' out.")
 
 
 def view_order(token_BSD: Tensor, rule: str) -> Tensor | None:

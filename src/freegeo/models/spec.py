@@ -21,11 +21,14 @@ Mixed = Literal["crop", "pad", "upstream"]
 MIXED: Mixed = "crop"
 
 
-Takes = Literal["nothing", "cameras"]
+Takes = Literal["nothing", "cameras", "parts"]
 """What a model can be told of its views.
 
-`cameras`: poses together with intrinsics, of all views or of none.
+`cameras`: poses together with intrinsics, of all views or of none. `parts`: any of poses, intrinsics and depth, of all
+views or of some.
 """
+NO_REFERENCE = "none"
+"""Reference-view rule of a model that treats all views alike."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +57,7 @@ class ModelSpec:
     loss_layers: tuple[int, ...]
     """Layers whose features the losses compare, ascending; the last one carries the relational loss."""
     reference: str
-    """Reference-view rule of the frozen model."""
+    """Reference-view rule of the frozen model; `NO_REFERENCE` for one that treats all views alike."""
     special_tokens: int
     """Tokens of a view that are no patches."""
     weights_licence: str
