@@ -22,6 +22,14 @@ VIEWS_PER_CHUNK = 8
 RAY_CHANNELS = 7
 
 
+def uv_axes(map_hw: tuple[int, int], aspect: float) -> tuple[Tensor, Tensor]:
+    """Return the normalised coordinates u (W,) and v (H,) of a map's pixels, float64; the half diagonal is 1."""
+    diagonal = (aspect**2 + 1) ** 0.5
+    ends = (half * (n - 1) / n for n, half in zip(map_hw[::-1], (aspect / diagonal, 1 / diagonal), strict=True))
+    u, v = (torch.linspace(-end, end, n, dtype=torch.float64) for n, end in zip(map_hw[::-1], ends, strict=True))
+    return u, v
+
+
 @lru_cache(maxsize=64)
 def uv_embedding(channels: int, map_hw: tuple[int, int], aspect: float, device: torch.device) -> Tensor:
     """Return sines and cosines of the normalised image coordinates, (channels, H, W), before the factor 0.1.
@@ -29,11 +37,7 @@ def uv_embedding(channels: int, map_hw: tuple[int, int], aspect: float, device: 
     `aspect` is the image's width over height; channels come as sin u, cos u, sin v, cos v, a quarter each.
     """
     with torch.inference_mode(False):
-        diagonal = (aspect**2 + 1) ** 0.5
-        axes = []
-        for size, half_extent in ((map_hw[1], aspect / diagonal), (map_hw[0], 1 / diagonal)):
-            end = half_extent * (size - 1) / size
-            axes.append(torch.linspace(-end, end, size, dtype=torch.float64))
+        axes = uv_axes(map_hw, aspect)
         quarter = channels // 4
         omega = 100.0 ** -(torch.arange(quarter, dtype=torch.float64) / quarter)
         u_cW, v_cH = (omega[:, None] * axis for axis in axes)

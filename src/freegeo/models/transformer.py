@@ -18,6 +18,8 @@ from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
 HEAD_NORM_EPS = 1e-5
+ENCODER_EPS = 1e-6
+"""Of DINOv2's norms."""
 ROPE_BASE = 100.0
 
 
@@ -131,18 +133,25 @@ class LayerScale(nn.Module):
 
 
 class Block(nn.Module):
-    """Pre-norm residual block with LayerScale."""
+    """Pre-norm residual block, with LayerScale unless `scaled` is off."""
 
     def __init__(
-        self, width: int, heads: int, *, qk_norm: bool = False, norm_eps: float, ffn: Literal["mlp", "swiglu"] = "mlp"
+        self,
+        width: int,
+        heads: int,
+        *,
+        qk_norm: bool = False,
+        norm_eps: float,
+        ffn: Literal["mlp", "swiglu"] = "mlp",
+        scaled: bool = True,
     ):
         super().__init__()
         self.norm1 = nn.LayerNorm(width, eps=norm_eps)
         self.attn = Attention(width, heads, qk_norm=qk_norm)
-        self.ls1 = LayerScale(width)
+        self.ls1 = LayerScale(width) if scaled else nn.Identity()
         self.norm2 = nn.LayerNorm(width, eps=norm_eps)
         self.mlp = Mlp(width, 4 * width) if ffn == "mlp" else SwiGlu(width)
-        self.ls2 = LayerScale(width)
+        self.ls2 = LayerScale(width) if scaled else nn.Identity()
 
     def forward(self, x_BLD: Tensor, rope: Rope | None = None) -> Tensor:
         """Run attention, then the feed-forward layer."""
@@ -160,13 +169,49 @@ def run_block(block: nn.Module, x_BLD: Tensor, rope: Rope | None, *, recompute: 
 class PatchEmbed(nn.Module):
     """Non-overlapping patches through one convolution, rows first."""
 
-    def __init__(self, patch_size: int, width: int):
+    def __init__(self, patch_size: int, width: int, *, channels: int = 3):
         super().__init__()
-        self.proj = nn.Conv2d(3, width, patch_size, patch_size)
+        self.proj = nn.Conv2d(channels, width, patch_size, patch_size)
 
-    def forward(self, images_B3HW: Tensor) -> Tensor:
+    def forward(self, images_BCHW: Tensor) -> Tensor:
         """Return patch tokens (B, P, D)."""
-        return self.proj(images_B3HW).flatten(2).transpose(1, 2)
+        return self.proj(images_BCHW).flatten(2).transpose(1, 2)
+
+
+class RegisterEncoder(nn.Module):
+    """DINOv2 with register tokens, as VGGT and Pi3 have it; views do not see each other."""
+
+    def __init__(
+        self,
+        width: int,
+        *,
+        depth: int,
+        heads: int,
+        registers: int,
+        patch_size: int,
+        position_grid: int,
+        channels: int = 3,
+    ):
+        super().__init__()
+        self.registers = registers
+        self.patch_embed = PatchEmbed(patch_size, width, channels=channels)
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
+        self.pos_embed = nn.Parameter(torch.zeros(1, position_grid**2 + 1, width))
+        self.register_tokens = nn.Parameter(torch.zeros(1, registers, width))
+        self.blocks = nn.ModuleList(Block(width, heads, norm_eps=ENCODER_EPS) for _ in range(depth))
+        self.norm = nn.LayerNorm(width, eps=ENCODER_EPS)
+
+    def forward(self, images_VCHW: Tensor, grid_hw: tuple[int, int]) -> Tensor:
+        """Return patch tokens (V, P, D) of normalised images."""
+        views = len(images_VCHW)
+        x = torch.cat([self.cls_token.expand(views, -1, -1), self.patch_embed(images_VCHW)], dim=1)
+        # Unlike stock DINOv2's, the table of positions is resized to the grid's size, with antialiasing.
+        x = x + position_table(self.pos_embed, grid_hw, size=grid_hw, antialias=True)
+        # Only the class token and the patches have positions, so the registers come in afterwards.
+        x = torch.cat([x[:, :1], self.register_tokens.expand(views, -1, -1), x[:, 1:]], dim=1)
+        for block in self.blocks:
+            x = block(x)
+        return self.norm(x)[:, 1 + self.registers :]
 
 
 def position_table(

@@ -27,54 +27,18 @@ from freegeo.models.spec import MIXED, Mixed, ModelSpec
 from freegeo.models.transformer import (
     Block,
     Mlp,
-    PatchEmbed,
+    RegisterEncoder,
     block_linears,
     first_and_others,
     grid_rope,
-    position_table,
     run_block,
 )
 from freegeo.models.vggt_config import VGGTConfig
 from freegeo.types import Features, ImageBatch, Prediction, Priors, ViewTokens
 
-ENCODER_EPS = 1e-6
 BLOCK_EPS = 1e-5
 MODULATED_EPS = 1e-6
 CAMERA_STEPS = 4
-
-
-class PatchEncoder(nn.Module):
-    """DINOv2 with register tokens; views do not see each other."""
-
-    def __init__(self, config: VGGTConfig):
-        super().__init__()
-        width = config.width
-        self.registers = config.registers
-        self.patch_embed = PatchEmbed(config.patch_size, width)
-        self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
-        self.pos_embed = nn.Parameter(torch.zeros(1, config.position_grid**2 + 1, width))
-        self.register_tokens = nn.Parameter(torch.zeros(1, config.registers, width))
-        # From DINOv2's training and never read; it is here because checkpoints must match name by name.
-        self.mask_token = nn.Parameter(torch.zeros(1, width))
-        self.blocks = nn.ModuleList(
-            Block(width, config.encoder_heads, norm_eps=ENCODER_EPS) for _ in range(config.encoder_depth)
-        )
-        self.norm = nn.LayerNorm(width, eps=ENCODER_EPS)
-
-    def forward(self, images_V3HW: Tensor, grid_hw: tuple[int, int]) -> Tensor:
-        """Return patch tokens (V, P, D) of normalised images."""
-        views = len(images_V3HW)
-        x = torch.cat([self.cls_token.expand(views, -1, -1), self.patch_embed(images_V3HW)], dim=1)
-        x = x + self.position_embedding(grid_hw)
-        # Only the class token and the patches have positions, so the registers come in afterwards.
-        x = torch.cat([x[:, :1], self.register_tokens.expand(views, -1, -1), x[:, 1:]], dim=1)
-        for block in self.blocks:
-            x = block(x)
-        return self.norm(x)[:, 1 + self.registers :]
-
-    def position_embedding(self, grid_hw: tuple[int, int]) -> Tensor:
-        """Return the embedding (1, 1 + P, D) of a patch grid; unlike stock DINOv2's, resized with antialiasing."""
-        return position_table(self.pos_embed, grid_hw, size=grid_hw, antialias=True)
 
 
 class Aggregator(nn.Module):
@@ -83,7 +47,12 @@ class Aggregator(nn.Module):
     def __init__(self, config: VGGTConfig):
         super().__init__()
         self.config = config
-        self.patch_embed = PatchEncoder(config)
+        self.patch_embed = RegisterEncoder(
+            config.width, depth=config.encoder_depth, heads=config.encoder_heads, registers=config.registers,
+            patch_size=config.patch_size, position_grid=config.position_grid,
+        )  # fmt: skip
+        # From DINOv2's training and never read; it is here because checkpoints must match name by name.
+        self.patch_embed.mask_token = nn.Parameter(torch.zeros(1, config.width))
         self.camera_token = nn.Parameter(torch.zeros(1, 2, 1, config.width))
         self.register_token = nn.Parameter(torch.zeros(1, 2, config.registers, config.width))
         self.frame_blocks, self.global_blocks = (
