@@ -28,7 +28,7 @@ from freegeo.training.config import TrainConfig
 from freegeo.training.loop import train
 from freegeo.types import ImageBatch, Priors
 from pretend_device import MixedDevicesError, NoFloat64Error, PretendDevice
-from tiny_models import noise, noise_scene, quick, tensors, tiny_da3, tiny_nested, tiny_vggt
+from tiny_models import noise, noise_scene, quick, tensors, tiny_da3, tiny_nested, tiny_pi3, tiny_pi3x, tiny_vggt
 
 ONCE_A_RUN = {
     "adaptation/adapt.py:_train",  # the model moves to the device
@@ -121,7 +121,7 @@ def test_a_device_without_float64_refuses_it():
 
 
 @pytest.mark.parametrize("device", ["cuda", "mps"])
-@pytest.mark.parametrize("make", [tiny_da3, tiny_vggt])
+@pytest.mark.parametrize("make", [tiny_da3, tiny_vggt, tiny_pi3, tiny_pi3x])
 @torch.no_grad()
 def test_a_prediction_stays_on_its_device(make, device):
     images, rule = noise(4), "saddle_balanced" if make is tiny_da3 else "first"
@@ -136,7 +136,7 @@ def test_a_prediction_stays_on_its_device(make, device):
     with pretended(device)() as pretend:
         model = make().to(device)
         tokens, found = predicted(model, pretend.device)
-        if make is tiny_da3:
+        if make in (tiny_da3, tiny_pi3x):
             priors = Priors(T_cam_world=found.T_cam_world.cpu(), K=found.K.cpu())
             model.aggregate(tokens, priors=priors)
         pretend.waits.clear()
@@ -160,6 +160,7 @@ RUNS = {
     "DA3, fp16 with its scaler, dropout": (tiny_da3, "cuda", "fp16", {"dropout": 0.1}),
     "VGGT, bf16, activations computed twice, samples on disk": (tiny_vggt, "cuda", "bf16", {}),
     "VGGT, released losses": (tiny_vggt, "cuda", "fp32", {"loss": asdict(recipes.RELEASED_VGGT.loss)}),
+    "Pi3, activations computed twice": (tiny_pi3, "cuda", "bf16", {"hold": 1.0}),
     "DA3 on Apple's GPU": (tiny_da3, "mps", "fp32", {"hold": 1.0}),
 }
 

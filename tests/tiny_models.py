@@ -12,7 +12,10 @@ from freegeo.models.api import ReconstructionModel
 from freegeo.models.da3 import DA3
 from freegeo.models.da3_config import DA3Config
 from freegeo.models.da3_metric import DA3Nested, DA3SingleView
-from freegeo.models.spec import AdaptationDefaults, ModelSpec
+from freegeo.models.pi3 import Pi3
+from freegeo.models.pi3_config import Pi3Config, Pi3XConfig
+from freegeo.models.pi3_config import build as build_pi3
+from freegeo.models.spec import NO_REFERENCE, AdaptationDefaults, ModelSpec
 from freegeo.models.vggt import VGGT
 from freegeo.models.vggt_config import VGGTConfig
 
@@ -52,6 +55,30 @@ def tiny_vggt(seed: int = 0, name: str = "tiny-vggt") -> VGGT:
         position_grid=4,
     )  # fmt: skip
     return randomise(VGGT(config, _spec(name, config.out_layers, special=config.special)), seed)
+
+
+PI3 = Pi3Config(
+    width=32, pairs=2, heads=2, encoder_depth=2, encoder_heads=2, head_width=24, head_depth=2, head_heads=3,
+    dense_out=16, camera_out=16, registers=3, encoder_registers=2, patch_size=PATCH, position_grid=4,
+)  # fmt: skip
+PI3X = replace(
+    PI3,
+    x=Pi3XConfig(
+        head_channels=(16, 16, 16), head_units=1, head_hidden=8, scale_width=16, scale_depth=1, scale_heads=2,
+        scale_out=12, pose_pairs=(0,),
+    ),
+)  # fmt: skip
+
+
+def tiny_pi3(seed: int = 0, name: str = "tiny-pi3") -> Pi3:
+    """Two encoder blocks and two pairs of blocks within and across views, width 32; all views alike."""
+    return randomise(build_pi3(PI3, _spec(name, (PI3.readout,), special=PI3.registers, reference=NO_REFERENCE)), seed)
+
+
+def tiny_pi3x(seed: int = 0, name: str = "tiny-pi3x") -> Pi3:
+    """The same with metres, and known poses, intrinsics and depth."""
+    spec = _spec(name, (PI3X.readout,), special=PI3X.registers, reference=NO_REFERENCE, takes="parts", metric=True)
+    return randomise(build_pi3(PI3X, spec), seed)
 
 
 def randomise(model: nn.Module, seed: int) -> nn.Module:
@@ -115,9 +142,9 @@ def trained(model: ReconstructionModel, seed: int = 1) -> Adapter:
     return adapter
 
 
-def _spec(name: str, layers: tuple[int, ...], special: int, **more) -> ModelSpec:
+def _spec(name: str, layers: tuple[int, ...], special: int, reference: str = "first", **more) -> ModelSpec:
     return ModelSpec(
-        name=name, patch_size=PATCH, default_side=4 * PATCH, loss_layers=layers, reference="first",
+        name=name, patch_size=PATCH, default_side=4 * PATCH, loss_layers=layers, reference=reference,
         special_tokens=special, weights_licence="none", adaptation=DEFAULTS, **more,
     )  # fmt: skip
 

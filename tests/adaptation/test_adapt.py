@@ -25,7 +25,7 @@ from freegeo.adaptation.views import chunk_windows, schedule
 from freegeo.errors import DivergedError, FreeGeoError, UserError
 from freegeo.models.precision import Compute
 from loss_tools import teacher_side
-from tiny_models import PATCH, noise, noise_scene, outputs, quick, same, tensors, tiny_da3, tiny_vggt
+from tiny_models import PATCH, noise, noise_scene, outputs, quick, same, tensors, tiny_da3, tiny_pi3, tiny_vggt
 
 IMAGES = noise(4)
 MODELS = {"da3": tiny_da3, "vggt": tiny_vggt}
@@ -113,6 +113,7 @@ CASES = {
     "da3-dropout-hold": (tiny_da3, lambda model: quick(model, steps=4, dropout=0.1, hold=1.0)),
     "da3-paper": (tiny_da3, lambda model: paper(model.spec, "eth3d").changed(sets_per_scene=3, rank=4)),
     "da3-released": (tiny_da3, lambda model: released("released-da3", "eth3d").changed(epochs=1, rank=2)),
+    "pi3-scene": (tiny_pi3, lambda model: quick(model, steps=5, hold=0.5)),
     "vggt-released": (tiny_vggt, lambda model: released("released-vggt", "eth3d").changed(sets_per_scene=2, rank=2)),
 }
 

@@ -3,13 +3,14 @@
 import pytest
 import torch
 
-from tiny_models import noise, same, tiny_da3, tiny_vggt, trained
+from tiny_models import noise, same, tiny_da3, tiny_pi3, tiny_vggt, trained
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
 @pytest.mark.parametrize(
-    ("make", "options"), [(tiny_da3, {"reference": "saddle_balanced"}), (tiny_vggt, {"layers": (0,)})]
+    ("make", "options"),
+    [(tiny_da3, {"reference": "saddle_balanced"}), (tiny_vggt, {"layers": (0,)}), (tiny_pi3, {"layers": (0, 2)})],
 )
 def test_aggregate_has_no_graph_break(make, options):
     model = make()

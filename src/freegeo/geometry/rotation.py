@@ -5,11 +5,13 @@ The order of a quaternion's numbers is part of every name: ``quat_xyzw`` (scalar
 """
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
 __all__ = [
+    "closest_rotation",
     "matrix_to_quat_xyzw",
     "mean_rotation",
     "quat_wxyz_to_xyzw",
@@ -111,3 +113,35 @@ def rotate(matrix: Tensor, vectors: Tensor) -> Tensor:
     return (flat @ matrix.mT).reshape(
         *torch.broadcast_shapes(vectors.shape[:leading], matrix.shape[:-2]), *vectors.shape[leading:]
     )
+
+
+def closest_rotation(matrix: Tensor) -> Tensor:
+    """Rotations (..., 3, 3) closest to matrices (..., 3, 3), in the sum of the squared differences of the entries.
+
+    Its gradient is written out (docs/models/pi3.md, "Cameras"): the one of the SVD itself divides by differences of
+    singular values, which all are 1 for a rotation.
+    """
+    return _ClosestRotation.apply(matrix)
+
+
+class _ClosestRotation(torch.autograd.Function):
+    """R = U diag(1, 1, e) V^T of the SVD U diag(s) V^T, with e = det(U V^T)."""
+
+    @staticmethod
+    def forward(ctx: Any, matrix: Tensor) -> Tensor:
+        U, s, Vh = torch.linalg.svd(matrix)
+        signs = torch.ones_like(s)
+        signs[..., 2] = torch.linalg.det(U @ Vh).sign()
+        ctx.save_for_backward(U, s, Vh, signs)
+        return (U * signs[..., None, :]) @ Vh
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        [gradient] = gradients
+        U, s, Vh, signs = ctx.saved_tensors
+        E = signs[..., :, None] * (U.mT @ gradient @ Vh.mT)
+        signed = signs * s
+        sums = signed[..., :, None] + signed[..., None, :]
+        # The diagonal is zero, whatever it is divided by.
+        Z = (E - E.mT) / torch.where(torch.eye(3, dtype=torch.bool, device=s.device), 1, sums)
+        return (U * signs[..., None, :]) @ Z @ Vh

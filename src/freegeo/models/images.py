@@ -131,13 +131,17 @@ def read_some(
     model: ReconstructionModel, photos: Sequence[PhotoLike], chosen: Sequence[int], mixed: Mixed
 ) -> ImageBatch:
     """Preprocess the chosen ones of photos to the size that all of them have together."""
-    wanted = [photos[number] for number in chosen]
     if len({photo.size_hw for photo in photos}) == 1:
-        return model.preprocess(wanted, mixed=mixed)
-    left = set(range(len(photos))) - set(chosen)
-    others = [SizeOnly(name=photos[number].name, size_hw=photos[number].size_hw) for number in sorted(left)]
-    batch = model.preprocess([*wanted, *others], mixed=mixed)
-    return batch if len(batch) == len(wanted) else batch.select(range(len(wanted)))
+        return model.preprocess([photos[number] for number in chosen], mixed=mixed)
+    # In the order of all photos, since the first one may decide.
+    wanted = sorted(set(chosen))
+    every = [
+        photo if number in wanted else SizeOnly(name=photo.name, size_hw=photo.size_hw)
+        for number, photo in enumerate(photos)
+    ]
+    batch = model.preprocess(every, mixed=mixed)
+    is_whole = len(batch) == len(photos)
+    return batch.select([number if is_whole else wanted.index(number) for number in chosen])
 
 
 def _warn(batch: ImageBatch, mixed: Mixed) -> None:
