@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,7 @@ from tiny_models import noise, noise_scene, quick, tiny_pi3, tiny_pi3x  # noqa: 
 
 RECORDED = dict(cases(TESTS / "fixtures" / "pi3"))
 VIEWS = 4
+CAUTION = build_empty("pi3").spec.adaptation.caution
 
 
 def random_rotations(count: int, generator: torch.Generator) -> torch.Tensor:
@@ -172,6 +174,14 @@ def test_an_adaptation_learns(model):
     learned = [terms["intra"] for terms in result.curve]
     assert sum(learned[-4:]) < sum(learned[:4])
     assert result.trouble is None
+
+
+def test_whoever_adapts_pi3_is_warned(caplog):
+    model = tiny_pi3()
+    model.spec = replace(model.spec, adaptation=replace(model.spec.adaptation, caution=CAUTION))
+    adapt(model, [noise_scene(4)], quick(model, steps=1), seed=42)
+    assert CAUTION in caplog.messages
+    assert "worse after adapting it" in CAUTION
 
 
 def test_pi3_takes_nothing_beside_photos(cameras):

@@ -216,6 +216,8 @@ def adapt(
         require_unchanged_images(recipe)
     compute = compute.preferring(recipe.precision)
     steps = scheduled(scenes, recipe, seed)
+    if plan is None and (caution := model.adaptable().spec.adaptation.caution):
+        logger.warning("%s", caution)
     plan = plan or plan_adaptation(model, scenes, recipe, visited(steps), compute=compute, folder=resume_in)
     wanted = {share: max(1, round(share * len(steps))) for share in keep_after}
     run = _Run(model.adaptable(), scenes, recipe, steps, seed, compute, resume_in, on_step, on_epoch, wanted)

@@ -44,6 +44,8 @@ class AdaptationDefaults:
     """Whether the model was trained on neighbouring frames only, so that its view sets are consecutive frames."""
     published: Literal["da3", "vggt"] | None = None
     """Which of the two published families of settings a dataset recipe takes; None: the paper's DA3 column."""
+    caution: str | None = None
+    """A sentence that everyone who adapts the model has to read."""
 
 
 @dataclass(frozen=True, kw_only=True)
