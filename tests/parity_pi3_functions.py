@@ -17,6 +17,7 @@ from freegeo.geometry.rotation import closest_rotation
 from freegeo.geometry.se3 import inverse
 from freegeo.models.dpt import confidence, uv_axes
 from freegeo.models.pi3 import LinearHead, camera_to_world, local_points
+from freegeo.models.pi3_config import PI3
 from freegeo.models.pi3_images import plan_size, preprocess
 from freegeo.models.pi3_priors import pixel_slopes, pose_tables, prepare, turn
 from freegeo.models.pi3x import LARGEST_LOG_DEPTH
@@ -27,6 +28,7 @@ FUNCTION = 1e-5
 FOCAL = 1e-6
 LEVEL = 1.01 / 255
 CPU = torch.device("cpu")
+PIXELS = PI3.pixels
 
 
 def check_rotation(path: Path) -> float:
@@ -164,7 +166,7 @@ def check_preprocess(path: Path) -> float:
     """Sizes of the table, then sampled pixels of the pictures that the second file holds."""
     table = json.loads(path.read_text())
     for row in table["sizes"]:
-        if plan_size((row["height"], row["width"]), 14) != (row["out_height"], row["out_width"]):
+        if plan_size((row["height"], row["width"]), 14, PIXELS) != (row["out_height"], row["out_width"]):
             return math.inf
     pixels = path.with_name("preprocess_pixels.safetensors")
     values = read_tensors(pixels, CPU) if pixels.is_file() else {}
@@ -175,7 +177,7 @@ def check_pixels(case: dict, values: dict[str, torch.Tensor]) -> float:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "picture.png"
         Image.fromarray(synthetic(case["width"], case["height"])).save(file)
-        batch = preprocess(load_photos([file]), patch=14)
+        batch = preprocess(load_photos([file]), patch=14, pixels=PIXELS)
     rows, columns = values[f"{case['id']}.yx"].long().unbind(1)
     found = (batch.images[0][:, rows, columns].T * 255).round()
     return float((found - values[f"{case['id']}.rgb"].float()).abs().max()) / (255 * LEVEL)

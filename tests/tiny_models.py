@@ -60,6 +60,7 @@ def tiny_vggt(seed: int = 0, name: str = "tiny-vggt") -> VGGT:
 PI3 = Pi3Config(
     width=32, pairs=2, heads=2, encoder_depth=2, encoder_heads=2, head_width=24, head_depth=2, head_heads=3,
     dense_out=16, camera_out=16, registers=3, encoder_registers=2, patch_size=PATCH, position_grid=4,
+    pixels=48 * 64,
 )  # fmt: skip
 PI3X = replace(
     PI3,

@@ -42,7 +42,7 @@ from freegeo.guarded import Evidence, scene_matches
 from freegeo.metres import ScaleSource, in_metres
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
-from freegeo.models.spec import ModelSpec, PoseFrom
+from freegeo.models.spec import NO_REFERENCE, ModelSpec, PoseFrom
 from freegeo.pipeline import (
     CPU,
     capital,
@@ -457,6 +457,7 @@ class Job:
         final, adaptation = found.result, found.adaptation
         why_not = adaptation.rejected or (adaptation.verdict or {}).get("reason")
         settings = dict(self.folder.settings)
+        told_in_order = self.priors is not None and self.spec.reference != NO_REFERENCE
         return {
             "format": FORMAT,
             "model": self.spec.name,
@@ -472,7 +473,7 @@ class Job:
             "refinement": self._refinement(),
             **found.about,
             "frozen_prediction": None if self.recipe is None else f"{FROZEN_FOLDER}/{PREDICTION_NAME}",
-            "reference_view": "first" if self.priors is not None else self.reference or self.spec.reference,
+            "reference_view": "first" if told_in_order else self.reference or self.spec.reference,
             "pose_from": self.pose_from if self.spec.cameras else None,
             "not_written": dict(failed),
             "warnings": list(self.warnings),

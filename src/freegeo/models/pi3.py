@@ -171,8 +171,9 @@ class Pi3(ReconstructionModel):
         return [name for i, block in enumerate(self.decoder) for name in block_linears(f"decoder.{i}", block)]
 
     def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED) -> ImageBatch:
-        """Resize to at most 255 000 pixels, the aspect kept up to whole patches."""
-        return pi3_images.preprocess(photos, patch=self.config.patch_size, mixed=mixed)
+        """Resize to the number of pixels that the model was trained with, the aspect kept up to whole patches."""
+        config = self.config
+        return pi3_images.preprocess(photos, patch=config.patch_size, pixels=config.pixels, mixed=mixed)
 
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:
         """Run the patch encoder on images (B, S, 3, H, W) in [0, 1]; `layers` changes nothing."""

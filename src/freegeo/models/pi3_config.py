@@ -61,6 +61,8 @@ class Pi3Config:
     """Side of a patch in pixels."""
     position_grid: int = 37
     """Side of the learned grid of positions, in patches."""
+    pixels: int = 255_000
+    """Most pixels of an image: those of the largest that the models were trained with."""
     x: Pi3XConfig | None = None
     """The further parts of Pi3X; None: Pi3."""
 

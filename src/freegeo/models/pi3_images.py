@@ -15,12 +15,9 @@ from freegeo.models.images import Size, images_of_one_size, require_a_patch
 from freegeo.models.spec import MIXED, Mixed
 from freegeo.types import ImageBatch, PhotoLike
 
-PIXELS = 255_000
-"""Most pixels of an image, those of the largest that the models were trained with."""
 
-
-def plan_size(photo: Size, patch: int, pixels: int = PIXELS) -> Size:
-    """Compute the size (height, width) for one photo."""
+def plan_size(photo: Size, patch: int, pixels: int) -> Size:
+    """Compute the size (height, width) for one photo: at most so many pixels, in whole patches."""
     height, width = photo
     scale = math.sqrt(pixels / (width * height))
     columns, rows = round(width * scale / patch), round(height * scale / patch)
@@ -38,7 +35,7 @@ def resize(pixels_HW3: Tensor, size: Size) -> Tensor:
     return torch.from_numpy(np.array(image))
 
 
-def preprocess(photos: Sequence[PhotoLike], *, patch: int, pixels: int = PIXELS, mixed: Mixed = MIXED) -> ImageBatch:
+def preprocess(photos: Sequence[PhotoLike], *, patch: int, pixels: int, mixed: Mixed = MIXED) -> ImageBatch:
     """Read and resize photos; upstream squashes all of them to the size that suits the first one."""
     if mixed == "upstream":
         sizes = [_plan_photo(photos[0], patch, pixels)] * len(photos)
