@@ -47,7 +47,7 @@ def test_check_says_what_is_missing_and_how_to_get_it(freegeo, tmp_path, monkeyp
     code, out, err = freegeo("check", tmp_path)
     assert code == 1
     for dataset in ("eth3d", "7scenes", "scannetpp", "hiroom"):
-        assert f"hf download depth-anything/DA3-BENCH {dataset}.zip --repo-type dataset" in out
+        assert f"freegeo bench download {dataset} --data {tmp_path}" in out
     assert "eth3d" in err.splitlines()[-1]
 
     monkeypatch.setattr(eth3d, "SCENES", ("pipes",))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,8 +10,6 @@ from pathlib import Path
 from freegeo.benchmark.tasks import DAMAGED, reason_of
 from freegeo.data.datasets import registry as datasets
 from freegeo.data.datasets.base import Dataset
-
-HUB_DATASET = "depth-anything/DA3-BENCH"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,13 +69,10 @@ def check_dataset(data: Path, name: str) -> Finding:
 
 
 def how_to_get(data: Path, dataset: Dataset) -> str:
-    """Commands that fetch and unpack a dataset; for one that is not on the hub, the folder to put its scenes into."""
-    if dataset.archive_gb is None:
+    """The command that fetches a dataset; for one that is not on the hub, the folder to put its scenes into."""
+    if dataset.archive is None:
         return f"put its scenes into {data / dataset.name}"
-    return (
-        f"hf download {HUB_DATASET} {dataset.name}.zip --repo-type dataset --local-dir {data} && "
-        f"unzip -q {data / dataset.name}.zip -d {data}   # {dataset.archive_gb} GB"
-    )
+    return f"freegeo bench download {dataset.name} --data {shlex.quote(str(data))}   # {dataset.archive.gb} GB"
 
 
 def _scene_problems(data: Path, dataset: Dataset, scene: str) -> list[str]:

@@ -17,6 +17,8 @@ from freegeo.models.catalog import EMBEDDED_MODEL
 from freegeo.progress import progress_bar
 
 if TYPE_CHECKING:
+    from freegeo.benchmark.check import Finding
+    from freegeo.benchmark.download import Offer
     from freegeo.benchmark.paper.experiments import Experiment
     from freegeo.benchmark.predict import Predictor
     from freegeo.benchmark.tasks import FrameRule, Problem, Task
@@ -115,6 +117,74 @@ def list_experiments() -> None:
 
 
 @app.command
+def download(*names: str, data: Path = DATA, yes: bool = False) -> None:
+    """Fetch datasets from the model hub, check and unpack them; what was downloaded already is kept.
+
+    Parameters
+    ----------
+    names
+        eth3d, 7scenes, scannetpp, hiroom.
+    data
+        Folder that gets the datasets.
+    yes
+        Accept the terms that are shown, and start without asking.
+    """
+    from freegeo.benchmark import download as archives
+    from freegeo.benchmark.check import check_dataset
+    from freegeo.benchmark.tasks import unique
+    from freegeo.lock import locked
+
+    if not names:
+        raise UserError("name at least one dataset: eth3d, 7scenes, scannetpp, hiroom.")
+    offers = [archives.offer(data, name) for name in unique(list(names))]
+    for one in offers:
+        console.say(f"{one.name}: {_offered(one)}\n  terms: {one.archive.terms}")
+    waiting = [one for one in offers if one.state != "complete"]
+    if not waiting:
+        return
+    missing = sum(one.size - one.kept for one in waiting)
+    free = archives.require_room(data, waiting)
+    console.say(
+        f"source: {archives.PAGE}\nto download: {archives.gigabytes(missing)}; free on the disk of {data}: "
+        f"{archives.gigabytes(free)}. The content is larger than the archives; it is measured before it is unpacked."
+    )
+    _require_yes(yes)
+    with locked(data):
+        for one in waiting:
+            archives.fetch(one)
+            with progress_bar(f"unpacking {one.name}, MB", 1 + one.size // 1_000_000) as update:
+                archives.unpack(one, data, lambda done, total, update=update, one=one: update(
+                    done * (1 + one.size // 1_000_000) // max(1, total)
+                ))  # fmt: skip
+            console.say(f"{one.name}: unpacked; {one.path} ({archives.gigabytes(one.size)}) is not needed any more")
+            _require_complete([check_dataset(data, one.name)], data)
+
+
+def _offered(one: Offer) -> str:
+    from freegeo.benchmark.download import gigabytes
+
+    if one.state == "complete":
+        return "complete, nothing to do"
+    if one.state == "archive":
+        return f"{one.path} ({gigabytes(one.size)}) is there and will be unpacked"
+    kept = f", {gigabytes(one.kept)} of them downloaded already" if one.kept else ""
+    return f"{one.path.name}, {gigabytes(one.size)}{kept}"
+
+
+def _require_yes(yes: bool) -> None:
+    """Return when the user agrees; UserError when there is nobody to ask, FreeGeoError when the answer is no."""
+    import sys
+
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise UserError("there is no terminal to ask in. Read the terms above, and pass --yes to accept them.")
+    console.say("Accept these terms and start? [y/N]")
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise UserError("nothing was downloaded.")
+
+
+@app.command
 def check(data: Path = DATA, *, datasets: str | None = None) -> None:
     """Say what is missing in a data folder and how to get it.
 
@@ -127,7 +197,11 @@ def check(data: Path = DATA, *, datasets: str | None = None) -> None:
     """
     from freegeo.benchmark.check import check_data
 
-    findings = check_data(data, None if datasets is None else _split(datasets))
+    _require_complete(check_data(data, None if datasets is None else _split(datasets)), data)
+
+
+def _require_complete(findings: Sequence[Finding], data: Path) -> None:
+    """Say what each dataset lacks; FreeGeoError when one does."""
     for finding in findings:
         console.say(f"{finding.dataset}: {finding.scenes} of {finding.wanted or '?'} scenes complete")
         for problem in finding.problems[:SHOWN_PROBLEMS]:

@@ -9,11 +9,16 @@ import os
 import re
 import ssl
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from freegeo.errors import UserError
 from freegeo.models.catalog import EMBEDDED_MODEL
 from freegeo.models.spec import ModelEntry
+
+if TYPE_CHECKING:
+    from huggingface_hub import HfFileMetadata
 
 logger = logging.getLogger(__name__)
 
@@ -22,6 +27,23 @@ _PROXIES = ("HTTPS_PROXY", "HTTP_PROXY", "ALL_PROXY")
 _PASSWORD = re.compile(r"(^|//)[^/]*@")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _INSTEAD = f"pass --checkpoint FILE, or use the embedded model: --model {EMBEDDED_MODEL}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class HubFile:
+    """A file of a repository of the hub, described as far as explaining a failed download takes."""
+
+    repository: str
+    """Its id, such as `depth-anything/DA3-BASE`."""
+    name: str
+    page: str
+    """Address of the repository's page, where its licence is accepted."""
+    folder: str
+    """Where it is downloaded to."""
+    elsewhere: str
+    """How another folder is chosen, without its name: `set HF_HOME to`."""
+    gated: bool = False
+    """The hub hands it out only to accounts that accepted its licence."""
 
 
 def fetch(item: ModelEntry, *, check_hash: bool = False) -> Path:
@@ -45,7 +67,7 @@ def fetch(item: ModelEntry, *, check_hash: bool = False) -> Path:
         logger.info("%s: truncated or damaged; it is downloaded again.", kept)
     try:
         url = huggingface_hub.hf_hub_url(item.hub_id, item.hub_file, revision=revision)
-        announced = _digest(_published_etag(url))
+        announced = digest_of(published(url).etag)
         if expected is not None and announced not in (None, expected):
             raise _another_file(item, announced, expected)
         if kept is not None and not kept.is_symlink():
@@ -60,7 +82,7 @@ def fetch(item: ModelEntry, *, check_hash: bool = False) -> Path:
     # The client raises errors of several libraries, by its version and the proxy; none of them is ours.
     except Exception as error:
         logger.debug("download of %s failed: %r", item.hub_id, error)
-        reason, remedy = _why(error, item)
+        reason, remedy = why(error, _described(item))
         missing = "is not on this machine" if kept is None else f"is damaged ({kept})"
         size = f"{item.download_bytes / 1e9:.1f} GB"
         raise UserError(
@@ -75,7 +97,7 @@ def fetch(item: ModelEntry, *, check_hash: bool = False) -> Path:
     if announced is None and expected is not None:
         raise _another_file(item, found, expected)
     raise UserError(
-        f"{path}: the download differs from what {_endpoint()} announced; something on the way damages it. Run "
+        f"{path}: the download differs from what {endpoint()} announced; something on the way damages it. Run "
         f"`freegeo models download {item.name}` on another network, {_INSTEAD}"
     )
 
@@ -93,7 +115,7 @@ def is_verified(path: Path, expected: str | None, *, check_hash: bool) -> bool:
     """
     note = _note(path)
     fresh = note.is_file() and note.stat().st_mtime_ns >= max(1, path.stat().st_mtime_ns)
-    if fresh and not check_hash and _noted_digest(path) == (expected or _noted_digest(path)):
+    if fresh and not check_hash and noted_digest(path) == (expected or noted_digest(path)):
         return _has_its_length(path)
     if _has_its_length(path) and (digest := sha256_of(path)) == (expected or digest):
         _write_note(note, digest, path)
@@ -154,7 +176,7 @@ def _revision(kept: Path, item: ModelEntry) -> str:
 
 def _known_digest(kept: Path) -> str | None:
     """Return the SHA-256 that a file of the cache had when it was downloaded, by the note or the cache's own name."""
-    return _noted_digest(kept) or _digest(kept.resolve().name)
+    return noted_digest(kept) or digest_of(kept.resolve().name)
 
 
 def _note(path: Path) -> Path:
@@ -162,9 +184,10 @@ def _note(path: Path) -> Path:
     return path.with_name(path.name + ".sha256")
 
 
-def _noted_digest(path: Path) -> str | None:
+def noted_digest(path: Path) -> str | None:
+    """Return the SHA-256 that a downloaded file had when it was compared; None without such a note."""
     try:
-        return _digest(_note(path).read_text("utf-8").partition(" ")[0])
+        return digest_of(_note(path).read_text("utf-8").partition(" ")[0])
     except (OSError, UnicodeError):
         return None
 
@@ -184,17 +207,17 @@ def _another_file(item: ModelEntry, found: str, expected: str) -> UserError:
     first = "freegeo names" if item.sha256 else "was downloaded first"
     remedy = "Get a newer freegeo" if item.sha256 else f"If you trust the new one, remove {_folder(item)}"
     return UserError(
-        f"{_endpoint()} has another file for {item.name} than the one that {first} (SHA-256 {found} instead of "
+        f"{endpoint()} has another file for {item.name} than the one that {first} (SHA-256 {found} instead of "
         f"{expected}); it was not used. {remedy} and run `freegeo models download {item.name}`, {_INSTEAD}"
     )
 
 
-def _digest(name: str | None) -> str | None:
+def digest_of(name: str | None) -> str | None:
     """Return a name or entity tag if it is a SHA-256: the hub's tag of a large file, and its name in the cache."""
     return name if name is not None and _SHA256.fullmatch(name) else None
 
 
-def _published_etag(url: str) -> str | None:
+def published(url: str) -> HfFileMetadata:
     """Request a file's headers once, without the hub library's retries, which take half a minute when offline."""
     import huggingface_hub
 
@@ -202,25 +225,34 @@ def _published_etag(url: str) -> str | None:
     level = hub_logger.level
     hub_logger.setLevel(logging.CRITICAL)
     try:
-        return huggingface_hub.get_hf_file_metadata(url, timeout=REACHABLE_WITHIN_S).etag
+        return huggingface_hub.get_hf_file_metadata(url, timeout=REACHABLE_WITHIN_S)
     finally:
         hub_logger.setLevel(level)
 
 
-def _why(error: BaseException, item: ModelEntry) -> tuple[str, str]:
-    """Return why a download failed, and what to do about it."""
-    from huggingface_hub import constants, errors
+def _described(item: ModelEntry) -> HubFile:
+    from huggingface_hub import constants
+
+    return HubFile(
+        repository=item.hub_id or "", name=item.hub_file, page=f"https://huggingface.co/{item.hub_id}",
+        folder=constants.HF_HUB_CACHE, elsewhere="set HF_HOME to", gated=item.gated,
+    )  # fmt: skip
+
+
+def why(error: BaseException, item: HubFile) -> tuple[str, str]:
+    """Return why a download failed, and what to do about it, as the beginning of a sentence that goes on with "and"."""
+    from huggingface_hub import errors
 
     text = (str(error).strip() or type(error).__name__).splitlines()[0][:200].rstrip(".")
     proxies = _settings(*_PROXIES)
     if isinstance(error, errors.LocalEntryNotFoundError) and error.__cause__ is not None:
-        return _why(error.__cause__, item)
+        return why(error.__cause__, item)
     if isinstance(error, errors.OfflineModeIsEnabled):
         return "HF_HUB_OFFLINE is set, which forbids downloads", "Unset it"
     if isinstance(error, errors.HfHubHTTPError):
         return _refused(error, item)
     if isinstance(error, errors.FileMetadataError):
-        return f"{_endpoint()} does not answer as a model hub does", "Check HF_ENDPOINT and the proxy"
+        return f"{endpoint()} does not answer as a model hub does", "Check HF_ENDPOINT and the proxy"
     if isinstance(error, UnicodeError) or "header value" in text:
         return "the access token holds letters that no token has", "Correct HF_TOKEN, or log in with `hf auth login`,"
     if isinstance(error, ImportError) and "SOCKS" in text:
@@ -231,22 +263,24 @@ def _why(error: BaseException, item: ModelEntry) -> tuple[str, str]:
     if proxies and (isinstance(error, ValueError) or type(error).__name__ == "InvalidURL"):
         return f"the proxy in {proxies} cannot be used ({text})", "Write it as http://HOST:PORT"
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f"the disk of {constants.HF_HUB_CACHE} is full", "Make room, or set HF_HOME to another disk,"
+        return f"the disk of {item.folder} is full", f"Make room, or {item.elsewhere} another disk,"
     if isinstance(error, PermissionError):
-        place = error.filename or constants.HF_HUB_CACHE
-        return f"{place} cannot be written to", "Set HF_HOME to a folder that can be"
+        place = error.filename or item.folder
+        return f"{place} cannot be written to", f"{item.elsewhere[0].upper()}{item.elsewhere[1:]} a folder that can be"
     if "HTTPError" in [kind.__name__ for kind in type(error).__mro__]:  # of httpx or httpx2, by the hub's version
         through = f" through {proxies}" if proxies else ""
-        return f"{_endpoint()} cannot be reached{through} ({text})", f"Go online{_licence_first(item)}"
+        return f"{endpoint()} cannot be reached{through} ({text})", f"Go online{_licence_first(item)}"
     return text, "Remove the cause"
 
 
-def _refused(error: Exception, item: ModelEntry) -> tuple[str, str]:
+def _refused(error: Exception, item: HubFile) -> tuple[str, str]:
     """Explain an answer of the hub that is an error: a licence, a name, a log-in, or its own trouble."""
+    from huggingface_hub.errors import GatedRepoError
+
     status = getattr(getattr(error, "response", None), "status_code", "an error")
-    if item.gated and status in (401, 403):
+    if isinstance(error, GatedRepoError) or (item.gated and status in (401, 403)):
         return "the hub gives it only to accounts that accepted its licence", _accept_licence(item)
-    answer = f"{_endpoint()} answered {status} for {item.hub_id}/{item.hub_file}"
+    answer = f"{endpoint()} answered {status} for {item.repository}/{item.name}"
     if status in (401, 403):
         return answer, "Log in with `hf auth login`, or unset HF_TOKEN,"
     if status == 404:
@@ -260,12 +294,12 @@ def _is_about_certificates(error: BaseException, text: str) -> bool:
     return isinstance(error, ssl.SSLError) or "CERTIFICATE" in text or no_file
 
 
-def _accept_licence(item: ModelEntry) -> str:
-    return f"Accept it at https://huggingface.co/{item.hub_id}, log in with `hf auth login`"
+def _accept_licence(item: HubFile) -> str:
+    return f"Accept it at {item.page}, log in with `hf auth login`"
 
 
-def _licence_first(item: ModelEntry) -> str:
-    return f", accept its licence at https://huggingface.co/{item.hub_id}, log in with `hf auth login`" * item.gated
+def _licence_first(item: HubFile) -> str:
+    return f", accept its licence at {item.page}, log in with `hf auth login`" * item.gated
 
 
 def _settings(*names: str) -> str:
@@ -278,7 +312,8 @@ def _without_password(address: str) -> str:
     return _PASSWORD.sub(r"\1", address)
 
 
-def _endpoint() -> str:
+def endpoint() -> str:
+    """Return the address of the hub."""
     from huggingface_hub import constants
 
     return constants.ENDPOINT

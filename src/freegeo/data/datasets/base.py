@@ -44,6 +44,16 @@ class DatasetConstants:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Archive:
+    """The archive `<name>.zip` of a dataset in the benchmark's repository on the hub."""
+
+    gb: float
+    """Size as the benchmark's manual gives it, rounded."""
+    terms: str
+    """What the data may be used for, in short, and the page that says it in full."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Dataset:
     """A dataset of the benchmark: its constants, and the functions that read its files.
 
@@ -70,8 +80,8 @@ class Dataset:
     recipe_row: str | None = None
     """Row of the per-dataset settings of adaptation (`freegeo.adaptation.recipe`). None: none are published, and those
     of generated rooms are used."""
-    archive_gb: float | None = None
-    """Size of the dataset's archive on the hub; None: it is not on the hub."""
+    archive: Archive | None = None
+    """The dataset's archive on the hub; None: it is not on the hub."""
     generated: bool = False
     """Whether scenes are rendered when they are first used, so that nothing can be missing."""
 

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from freegeo.data.colmap_files import read_cameras, read_images
-from freegeo.data.datasets.base import Dataset, DatasetConstants, existing, read_gray, require_folder
+from freegeo.data.datasets.base import Archive, Dataset, DatasetConstants, existing, read_gray, require_folder
 from freegeo.data.photos import open_photos
 from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError
@@ -128,5 +128,8 @@ ETH3D = Dataset(
     valid_mask=valid_mask,
     depth_of_every_frame=False,  # only where a laser scan was rendered
     recipe_row=NAME,
-    archive_gb=14.1,
+    archive=Archive(
+        gb=14.1,
+        terms="research only, under the terms of ETH3D: https://www.eth3d.net",
+    ),
 )

@@ -19,7 +19,7 @@ from tokenize import TokenError
 import numpy as np
 import torch
 
-from freegeo.data.datasets.base import Dataset, DatasetConstants, existing, read_gray, require_folder
+from freegeo.data.datasets.base import Archive, Dataset, DatasetConstants, existing, read_gray, require_folder
 from freegeo.data.photos import open_photos
 from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError, UserError
@@ -120,5 +120,8 @@ HIROOM = Dataset(
     read_depth=read_depth,
     valid_mask=valid_mask,
     recipe_row=NAME,
-    archive_gb=0.7,
+    archive=Archive(
+        gb=0.7,
+        terms="research only, under the terms of SVLightVerse, its source: https://jerrypiglet.github.io/SVLightVerse",
+    ),
 )

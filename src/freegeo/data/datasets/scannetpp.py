@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from freegeo.data.colmap_files import ColmapCamera, read_cameras, read_images
-from freegeo.data.datasets.base import Dataset, DatasetConstants, existing, read_gray, require_folder
+from freegeo.data.datasets.base import Archive, Dataset, DatasetConstants, existing, read_gray, require_folder
 from freegeo.data.photos import open_photos
 from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError, UserError
@@ -159,5 +159,9 @@ SCANNETPP = Dataset(
     read_depth=read_depth,
     valid_mask=valid_mask,
     recipe_row=NAME,
-    archive_gb=10.1,
+    archive=Archive(
+        gb=10.1,
+        terms="non-commercial research and education only, for people who accepted the terms of ScanNet++ themselves: "
+        "apply at https://kaldir.vc.in.tum.de/scannetpp",
+    ),
 )

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from freegeo.data.datasets.base import Dataset, DatasetConstants, existing, read_gray, require_folder
+from freegeo.data.datasets.base import Archive, Dataset, DatasetConstants, existing, read_gray, require_folder
 from freegeo.data.photos import open_photos
 from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import FreeGeoError
@@ -100,5 +100,9 @@ SEVEN_SCENES = Dataset(
     read_depth=read_depth,
     valid_mask=valid_mask,
     recipe_row=NAME,
-    archive_gb=3.3,
+    archive=Archive(
+        gb=3.3,
+        terms="research only, under Microsoft Research's terms of 7-Scenes: "
+        "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes",
+    ),
 )
