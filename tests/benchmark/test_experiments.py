@@ -2,8 +2,8 @@ import pytest
 
 from freegeo.adaptation.recipe import named
 from freegeo.benchmark.paper.experiments import EXPERIMENTS, ROOMS, chosen, datasets_of
-from freegeo.benchmark.paper.published import Cell, paper_table
-from freegeo.benchmark.paper.tables import NAMES, published_value
+from freegeo.benchmark.paper.published import Cell, Printed, paper_table
+from freegeo.benchmark.paper.tables import NAMES, published
 from freegeo.benchmark.paper.variants import VARIANTS, Variant, variant
 from freegeo.errors import UserError
 from tiny_models import tiny_da3
@@ -50,9 +50,11 @@ def test_an_experiment_is_complete(entry):
 def test_published_numbers_are_found(name, label, dataset, metric, family, printed):
     entry = EXPERIMENTS[name]
     (line,) = [line for line in entry.lines if line.label == label]
-    assert published_value(entry, line, dataset, metric, family) == pytest.approx(printed)
-    assert published_value(entry, line, "procedural-light", metric, family) is None
-    assert published_value(entry, line, dataset, metric, None) is None
+    found = published(entry, line, dataset, metric, family)
+    assert found is not None
+    assert found.value == pytest.approx(printed)
+    assert published(entry, line, "procedural-light", metric, family) is None
+    assert published(entry, line, dataset, metric, None) is None
 
 
 def test_the_gain_compares_the_same_frames():
@@ -69,12 +71,12 @@ def test_every_published_line_with_a_place_has_numbers():
         for line in entry.lines:
             if line.paper and entry.layout == "means":
                 dataset = entry.published_dataset or "eth3d"
-                assert published_value(entry, line, dataset, entry.metrics[-1], "da3") is not None, (entry.name, line)
+                assert published(entry, line, dataset, entry.metrics[-1], "da3") is not None, (entry.name, line)
 
 
 def test_the_cross_view_table_is_in_percent():
     table = paper_table("cross_view_count")
-    assert table.value({"views": 16}, Cell(None, "overall", "da3")) == -7.67
+    assert table.printed({"views": 16}, Cell(None, "overall", "da3")) == Printed(-7.67, 0.005)
 
 
 def test_tasks_cover_lines_scenes_and_seeds_once():

@@ -23,12 +23,19 @@ class Finding:
     """Scenes of the published list; 0 when the list itself is missing."""
     problems: tuple[str, ...]
     """What is missing or damaged, scene by scene."""
+    blocking: tuple[str, ...] = ()
+    """Those of them without which a scene can be predicted and scored no more."""
     how_to_get: str
 
     @property
     def complete(self) -> bool:
-        """Whether every scene can be predicted and scored."""
+        """Whether nothing is missing."""
         return not self.problems
+
+    @property
+    def usable(self) -> bool:
+        """Whether every scene can be predicted and scored, as published, whatever else is missing."""
+        return not self.blocking
 
 
 def check_data(data: Path, names: Sequence[str] | None = None) -> list[Finding]:
@@ -53,19 +60,27 @@ def check_dataset(data: Path, name: str) -> Finding:
         return Finding(dataset=name, scenes=0, wanted=0, problems=(), how_to_get="rendered when it is used")
     how = how_to_get(data, dataset)
     if not (data / name).is_dir():
-        return Finding(dataset=name, scenes=0, wanted=0, problems=(f"{data / name}: no such folder",), how_to_get=how)
+        return _nothing(name, f"{data / name}: no such folder", how)
     try:
         scenes = datasets.scene_names(data, name)
     except DAMAGED as error:
-        return Finding(dataset=name, scenes=0, wanted=0, problems=(reason_of(error),), how_to_get=how)
-    problems = {scene: _scene_problems(data, dataset, scene) for scene in scenes}
+        return _nothing(name, reason_of(error), how)
+    found = {scene: _scene_problems(data, dataset, scene) for scene in scenes}
+    said = [
+        (f"{scene}: {problem}", blocks) for scene, problems in found.items() for problem, blocks in problems.items()
+    ]
     return Finding(
         dataset=name,
-        scenes=sum(not found for found in problems.values()),
+        scenes=sum(not problems for problems in found.values()),
         wanted=len(scenes),
-        problems=tuple(f"{scene}: {problem}" for scene, found in problems.items() for problem in found),
+        problems=tuple(problem for problem, _ in said),
+        blocking=tuple(problem for problem, blocks in said if blocks),
         how_to_get=how,
     )
+
+
+def _nothing(name: str, reason: str, how: str) -> Finding:
+    return Finding(dataset=name, scenes=0, wanted=0, problems=(reason,), blocking=(reason,), how_to_get=how)
 
 
 def how_to_get(data: Path, dataset: Dataset) -> str:
@@ -75,20 +90,21 @@ def how_to_get(data: Path, dataset: Dataset) -> str:
     return f"freegeo bench download {dataset.name} --data {shlex.quote(str(data))}   # {dataset.archive.gb} GB"
 
 
-def _scene_problems(data: Path, dataset: Dataset, scene: str) -> list[str]:
+def _scene_problems(data: Path, dataset: Dataset, scene: str) -> dict[str, bool]:
+    """What a scene lacks, and whether it can be scored without."""
     try:
         loaded = datasets.load_scene(data, dataset.name, scene)
     except DAMAGED as error:
-        return [reason_of(error)]
+        return {reason_of(error): True}
     truth = loaded.truth
     if truth is None:
-        return ["no ground truth, so it cannot be scored"]
-    problems = []
+        return {"no ground truth, so it cannot be scored": True}
+    problems = {}
     if not truth.surface.is_file():
-        problems.append(f"{truth.surface}: no such file (ground truth)")
+        problems[f"{truth.surface}: no such file (ground truth)"] = True
     without = sum(path is None for path in truth.depth)
     if without and dataset.depth_of_every_frame and dataset.read_depth is not None:
-        problems.append(f"{without} of {len(loaded)} frames have no ground-truth depth, so they are fused unmasked")
+        problems[f"{without} of {len(loaded)} frames have no ground-truth depth, so they are fused unmasked"] = False
     if len(loaded) < 3:
-        problems.append(f"{len(loaded)} frames: fewer than 3 cannot be aligned")
+        problems[f"{len(loaded)} frames: fewer than 3 cannot be aligned"] = True
     return problems

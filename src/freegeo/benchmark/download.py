@@ -86,10 +86,10 @@ def offer(data: Path, name: str) -> Offer:
         raise UserError(f"{name} is not on the hub: get it from its authors, and put it into {data / name}.")
     path = data / f"{name}.zip"
     if (data / name).exists():
-        problems = check_dataset(data, name).problems
-        if problems:
+        blocking = check_dataset(data, name).blocking
+        if blocking:
             raise UserError(
-                f"{data / name} is there, but not complete ({problems[0]}). Move it away and run again; the whole "
+                f"{data / name} is there, but not complete ({blocking[0]}). Move it away and run again; the whole "
                 "dataset is then unpacked anew."
             )
         return Offer(name=name, archive=dataset.archive, path=path, state="complete", size=0)

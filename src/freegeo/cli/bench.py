@@ -17,9 +17,13 @@ from freegeo.models.catalog import EMBEDDED_MODEL
 from freegeo.progress import progress_bar
 
 if TYPE_CHECKING:
+    import torch
+
+    from freegeo.adaptation.recipe import Recipe
     from freegeo.benchmark.check import Finding
     from freegeo.benchmark.download import Offer
     from freegeo.benchmark.paper.experiments import Experiment
+    from freegeo.benchmark.paper.reproduction import Reproduction
     from freegeo.benchmark.predict import Predictor
     from freegeo.benchmark.tasks import FrameRule, Problem, Task
     from freegeo.models.spec import AdaptationDefaults
@@ -102,7 +106,28 @@ class PredictOptions:
     """Spread the tasks over a ray cluster (extra `cluster`)."""
 
 
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ReproduceOptions(BenchOptions):
+    """What a reproduction of the paper is made of."""
+
+    output: Annotated[Path, Parameter(name=("--output", "-o"))] = Path("out/reproduction")
+    """Folder of predictions, adapters, results, tables and the page."""
+    datasets: str = "eth3d,7scenes,scannetpp,hiroom"
+    """The paper's datasets that are used, separated by commas; one that is not complete is left out."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ReproduceModel(BenchModel):
+    """Which model is compared with the paper."""
+
+    model: str = "da3-giant"
+    """Name or hub id of a model of a family that the paper reports; the paper's are da3-giant and vggt-1b."""
+
+
 BENCH, MODEL, RECIPE, PREDICT = BenchOptions(), BenchModel(), BenchRecipe(), PredictOptions()
+REPRODUCE, REPRODUCE_MODEL = ReproduceOptions(), ReproduceModel()
 
 
 @app.command(name="list")
@@ -157,7 +182,7 @@ def download(*names: str, data: Path = DATA, yes: bool = False) -> None:
                     done * (1 + one.size // 1_000_000) // max(1, total)
                 ))  # fmt: skip
             console.say(f"{one.name}: unpacked; {one.path} ({archives.gigabytes(one.size)}) is not needed any more")
-            _require_complete([check_dataset(data, one.name)], data)
+            _require([check_dataset(data, one.name)], data, "usable", "not to be used")
 
 
 def _offered(one: Offer) -> str:
@@ -197,11 +222,12 @@ def check(data: Path = DATA, *, datasets: str | None = None) -> None:
     """
     from freegeo.benchmark.check import check_data
 
-    _require_complete(check_data(data, None if datasets is None else _split(datasets)), data)
+    findings = check_data(data, None if datasets is None else _split(datasets))
+    _require(findings, data, "complete", "incomplete")
 
 
-def _require_complete(findings: Sequence[Finding], data: Path) -> None:
-    """Say what each dataset lacks; FreeGeoError when one does."""
+def _require(findings: Sequence[Finding], data: Path, property: Literal["complete", "usable"], otherwise: str) -> None:
+    """Say what each dataset lacks; FreeGeoError when one does not have a property."""
     for finding in findings:
         console.say(f"{finding.dataset}: {finding.scenes} of {finding.wanted or '?'} scenes complete")
         for problem in finding.problems[:SHOWN_PROBLEMS]:
@@ -210,9 +236,8 @@ def _require_complete(findings: Sequence[Finding], data: Path) -> None:
             console.say(f"  and {len(finding.problems) - SHOWN_PROBLEMS} more")
         if not finding.complete:
             console.say(f"  get it: {finding.how_to_get}")
-    incomplete = [finding.dataset for finding in findings if not finding.complete]
-    if incomplete:
-        raise FreeGeoError(f"{data}: incomplete for {', '.join(incomplete)}; the lines above say what is missing.")
+    if wrong := [finding.dataset for finding in findings if not getattr(finding, property)]:
+        raise FreeGeoError(f"{data}: {otherwise} for {', '.join(wrong)}; the lines above say what is missing.")
 
 
 @app.command
@@ -278,23 +303,203 @@ def run(
     figures
         Draw the figures too.
     """
+    predictor, tasks = _prepare(experiments, bench, model, recipe, options)
+    problems, scored = _both_stages(predictor, tasks, bench, model, options)
+    if scored:
+        _tables(experiments, bench)
+    if scored and figures:
+        _figures(bench)
+    _require_none(problems, bench.output)
+
+
+@app.command
+def reproduce(
+    *,
+    tables: str | None = None,
+    bench: ReproduceOptions = REPRODUCE,
+    model: ReproduceModel = REPRODUCE_MODEL,
+    recipe: BenchRecipe = RECIPE,
+    options: PredictOptions = PREDICT,
+    estimate_only: bool = False,
+) -> None:
+    """Run every table of the paper that the model and the data allow, and write ours beside the paper's.
+
+    Parameters
+    ----------
+    tables
+        Only these, separated by commas (`freegeo bench list`).
+    estimate_only
+        Only say what would be run and what it would cost.
+    """
+    from dataclasses import replace
+
+    from freegeo.benchmark.check import check_data
+    from freegeo.benchmark.paper.experiments import EXPERIMENTS
+    from freegeo.benchmark.paper.reproduction import PAPER_DATASETS, PAPER_TABLES, left_out
+    from freegeo.benchmark.tasks import unique
+
+    if options.given_cameras:
+        raise UserError("no table of the paper was made with given cameras; leave --given-cameras out.")
+    names = PAPER_TABLES if tables is None else unique(_split(tables))
+    if unknown := [name for name in names if name not in PAPER_TABLES]:
+        raise UserError(f"--tables {unknown[0]}: the paper's tables are {', '.join(PAPER_TABLES)}.")
+    datasets = unique(_split(bench.datasets))
+    if unknown := [name for name in datasets if name not in PAPER_DATASETS]:
+        raise UserError(f"--datasets {unknown[0]}: the paper's are {', '.join(PAPER_DATASETS)}.")
+    family = _adaptation(model.name).published
+    if family is None:
+        raise UserError(f"the paper reports no model like {model.name}; choose da3-giant or vggt-1b.")
+    findings = check_data(bench.data, datasets)
+    incomplete = {finding.dataset: finding.blocking[0] for finding in findings if finding.blocking}
+    complete = [name for name in datasets if name not in incomplete]
+    if not complete:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in incomplete.items())
+        raise UserError(
+            f"no dataset of the paper is complete in {bench.data} ({reasons}). `freegeo bench download` fetches them."
+        )
+    reasons = {name: left_out(EXPERIMENTS[name], family, incomplete, complete) for name in names}
+    running = [name for name, reason in reasons.items() if reason is None]
+    console.say(f"{len(running)} of {len(names)} tables: {', '.join(running) or 'none'}")
+    not_run = tuple((name, EXPERIMENTS[name].title, reason) for name, reason in reasons.items() if reason is not None)
+    for name, _, reason in not_run:
+        console.say(f"  not {name}: {reason}")
+    for name, reason in incomplete.items():
+        console.say(f"  without {name}: {reason}")
+    if not running:
+        raise UserError("none of these tables can be run; the lines above say why.")
+    chosen_bench = replace(bench, datasets=",".join(complete))
+    predictor, tasks = _prepare(running, chosen_bench, model, recipe, options)
+    if estimate_only:
+        _predict(predictor, tasks, chosen_bench, estimate_only=True)
+        return
+    problems, scored = _both_stages(predictor, tasks, chosen_bench, model, options)
+    if scored:
+        _tables(running, chosen_bench, shown=False)
+        page = _reproduction(running, predictor, chosen_bench, model, recipe, problems)
+        _write_page(
+            replace(
+                page,
+                not_run=not_run,
+                doubts=(
+                    *page.doubts,
+                    *(f"Without {name}: {reason}." for name, reason in incomplete.items()),
+                    *(f"{f.dataset}: {problem}." for f in findings if f.usable for problem in f.problems),
+                ),
+            ),
+            bench.output,
+        )
+    _require_none(problems, bench.output)
+
+
+def _reproduction(
+    names: Sequence[str],
+    predictor: Predictor,
+    bench: BenchOptions,
+    model: BenchModel,
+    recipe: BenchRecipe,
+    problems: Sequence[Problem],
+) -> Reproduction:
+    """Compare the results of a run with the paper's tables, and gather what they were made with."""
+    from datetime import UTC, datetime
+
+    from freegeo.benchmark.paper.experiments import experiment
+    from freegeo.benchmark.paper.published import PAPER_MODELS
+    from freegeo.benchmark.paper.reproduction import Reproduction, compared_table
+    from freegeo.benchmark.results import read_results
+    from freegeo.data.datasets.registry import scene_names
+    from freegeo.job import versions
+
+    family, rule = predictor.model.spec.adaptation.published or "", _rule(bench, model.name)
+    rows = read_results(bench.output)
+    datasets = _split(bench.datasets)
+    scenes = {dataset: scene_names(bench.data, dataset) for dataset in datasets}
+    recipes = {dataset: _flat(predictor.recipe(dataset)) for dataset in datasets}
+    doubts = []
+    name = predictor.model.spec.name
+    if name != PAPER_MODELS[family]:
+        doubts.append(
+            f"The paper's numbers are of {PAPER_MODELS[family]}, these of {name}: both things differ at once."
+        )
+    if bench.quick:
+        doubts.append(
+            f"A quick trial: at most {QUICK_SCENES} scenes of a dataset, one seed, {QUICK_STEPS} steps of adaptation. "
+            "Nothing is marked."
+        )
+    if changed := {setting: value for setting, value in recipe.changes().items() if value not in (None, {})}:
+        settings = ", ".join(f"{setting} = {value}" for setting, value in changed.items())
+        doubts.append(f"The adaptation was changed by hand ({settings}), so adapted rows are not the paper's.")
+    if bench.frames is not None:
+        doubts.append(f"The frames were chosen by the rule {bench.frames} on request.")
+    if problems:
+        doubts.append(f"{len(problems)} parts failed; they are listed below, and their cells are not marked.")
+    loaded, compute = predictor.model.loaded_from, predictor.compute
+    facts = (
+        ("model", name),
+        ("weights", f"{loaded.file}, fingerprint {loaded.fingerprint}" if loaded else "unknown"),
+        ("recipe", f"{recipe.recipe}, one adapter per {predictor.setup.adapt_per}, seed {model.seed}"),
+        ("datasets", ", ".join(f"{dataset} ({len(own)} scenes)" for dataset, own in scenes.items())),
+        ("device", f"{_device(compute.device)}, predictions in {compute.precision}"),
+        ("versions", ", ".join(f"{package} {version}" for package, version in versions().items())),
+        ("finished", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
+        ("command", console.command_line()),
+    )
+    return Reproduction(
+        facts=facts,
+        doubts=(*doubts, *console.warned()),
+        tables=tuple(
+            compared_table(experiment(table), rows, scenes, rule=rule, family=family, judged=not bench.quick)
+            for table in names
+        ),
+        not_run=(),
+        problems=tuple(str(problem) for problem in problems),
+        datasets=tuple(datasets),
+        settings=tuple(
+            (setting, tuple(recipes[dataset][setting] for dataset in datasets)) for setting in recipes[datasets[0]]
+        ),
+    )
+
+
+def _device(device: torch.device) -> str:
+    """The name of a device, of a GPU by its maker."""
+    import torch
+
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type.upper()
+
+
+def _flat(recipe: Recipe) -> dict[str, str]:
+    """The settings of a recipe as text, those of the loss beside the others."""
+    from dataclasses import asdict
+
+    settings = asdict(recipe)
+    loss = settings.pop("loss")
+    return {name: str(value) for name, value in (settings | {f"loss.{k}": v for k, v in loss.items()}).items()}
+
+
+def _write_page(page: Reproduction, out: Path) -> None:
+    from freegeo.files import atomic_path
+    from freegeo.report.reproduction import render
+
+    for name, text in (("reproduction.html", render(page)), ("reproduction.md", page.as_markdown())):
+        with atomic_path(out / name) as part:
+            part.write_text(text, encoding="utf-8")
+        console.say(str(out / name))
+    console.say(page.answer)
+
+
+def _both_stages(
+    predictor: Predictor, tasks: list[Task], bench: BenchOptions, model: BenchModel, options: PredictOptions
+) -> tuple[list[Problem], bool]:
+    """Predict and score; returns what failed, and whether there is anything that was scored."""
     from freegeo.benchmark.tasks import stored_tasks
 
-    predictor, tasks = _prepare(experiments, bench, model, recipe, options)
     problems = _predict(predictor, tasks, bench, cluster=options.cluster)
     # Failed predictions are reported already, so only stored tasks are evaluated.
     stored = {task for task, _ in stored_tasks(bench.output)}
     wanted = [task for task in tasks if task in stored]
-    if not wanted:
-        _say(problems)
-        _require_none(problems, bench.output)
-        return
-    problems += _evaluate(bench, model.device, wanted=wanted)
+    if wanted:
+        problems += _evaluate(bench, model.device, wanted=wanted)
     _say(problems)
-    _tables(experiments, bench)
-    if figures:
-        _figures(bench)
-    _require_none(problems, bench.output)
+    return problems, bool(wanted)
 
 
 def _prepare(
@@ -361,10 +566,17 @@ def _predict(
     console.say(f"{len(tasks)} tasks, {len(tasks) - len(waiting)} of them finished")
     if not waiting:
         return []
-    for line in estimate(predictor, waiting).lines():
+    predicting = estimate(predictor, waiting)
+    for line in predicting.lines():
         console.say(f"  {line}")
-    for cost in estimate_scoring(bench.data, waiting, device=predictor.compute.device):
+    scoring = estimate_scoring(bench.data, waiting, device=predictor.compute.device)
+    for cost in scoring:
         console.say(f"  {cost.line()}")
+    hours = (predicting.seconds + sum(cost.seconds for cost in scoring)) / 3600
+    console.say(
+        f"  in all about {hours:.1f} hours on {_device(predictor.compute.device)}, by one pass of each size, a few "
+        "steps and one small fusion that were measured just now; reading photos is not in it"
+    )
     if estimate_only:
         return []
     with locked(bench.output), progress_bar("predicting", len(waiting)) as update:
@@ -405,8 +617,8 @@ def _evaluate(bench: BenchOptions, device: str | None, *, wanted: list[Task] | N
     return result.problems
 
 
-def _tables(experiments: Sequence[str], bench: BenchOptions) -> None:
-    """Print the tables as text and write them in every format."""
+def _tables(experiments: Sequence[str], bench: BenchOptions, *, shown: bool = True) -> None:
+    """Write the tables in every format, and print them as text where they are to be `shown`."""
     from freegeo.benchmark.paper.experiments import chosen
     from freegeo.benchmark.paper.tables import TABLE_WRITERS, as_text, experiment_tables
     from freegeo.benchmark.results import read_results
@@ -419,7 +631,7 @@ def _tables(experiments: Sequence[str], bench: BenchOptions) -> None:
         tables = experiment_tables(entry, rows, rule=rule, family=family)
         if not _has_own(entry, tables):
             continue
-        for table in tables:
+        for table in tables if shown else ():
             console.say(f"\n{as_text(table)}")
         for ending, layout in TABLE_WRITERS.items():
             with atomic_path(bench.output / TABLES / f"{entry.name}.{ending}") as part:

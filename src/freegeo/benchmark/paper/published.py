@@ -13,6 +13,9 @@ from freegeo.errors import UserError
 
 FILE = "paper_tables.json"
 FAMILIES = ("da3", "vggt")
+FAMILY_NAMES = {"da3": "Depth Anything 3", "vggt": "VGGT"}
+PAPER_MODELS = {"da3": "da3-giant", "vggt": "vggt-1b"}
+"""Which model of each family the paper reports."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,16 @@ class Cell:
     metric: str
     family: str | None
     """Model family, where the table names it."""
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A number as the paper prints it."""
+
+    value: float
+    """A fraction, metres, or percent of change."""
+    half_digit: float
+    """Half a unit of its last printed digit: what rounding may have changed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +59,8 @@ class PaperTable:
                 return row
         return None
 
-    def value(self, fields: Mapping[str, Any], cell: Cell) -> float | None:
-        """A published number as a fraction (or metres, or percent of change); None when the paper has none."""
+    def printed(self, fields: Mapping[str, Any], cell: Cell) -> Printed | None:
+        """A published number; None when the paper has none."""
         row = self.row(fields, cell.family)
         if row is None or not fields:
             return None
@@ -83,7 +96,8 @@ def paper_table(key: str) -> PaperTable:
     )
 
 
-def _number(printed: str, column: str) -> float:
+def _number(printed: str, column: str) -> Printed:
     text = printed.strip().removesuffix("%")
-    value = float(text.removesuffix("M")) * (1e6 if text.endswith("M") else 1)
-    return value / 100 if column.endswith("_percent") else value
+    scale = (1e6 if text.endswith("M") else 1) / (100 if column.endswith("_percent") else 1)
+    text = text.removesuffix("M")
+    return Printed(float(text) * scale, 0.5 * 10.0 ** -len(text.partition(".")[2]) * scale)

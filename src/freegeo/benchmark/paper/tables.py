@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from freegeo.benchmark.paper.experiments import ROOMS, Experiment, Line, datasets_of
-from freegeo.benchmark.paper.published import FAMILIES, Cell, PaperTable, paper_table
+from freegeo.benchmark.paper.published import FAMILIES, Cell, PaperTable, Printed, paper_table
 from freegeo.benchmark.results import SMALLER_IS_BETTER, Row, choose, entries, mean, paired
 from freegeo.benchmark.tasks import FrameRule
 from freegeo.data.procedural.splits import PREFIX
@@ -242,6 +242,11 @@ def number(value: float | None, metric: str) -> str:
     return EMPTY if value is None else f"{value:,.{DIGITS.get(metric, 3)}f}"
 
 
+def signed(value: float, metric: str) -> str:
+    """A difference as it is printed."""
+    return _signed(value, DIGITS.get(metric, 3))
+
+
 def as_text(table: Table) -> str:
     """Plain text with aligned columns."""
     cells = [table.header, *table.rows]
@@ -296,13 +301,13 @@ def _mean_cell(entry: Experiment, line: Line, picked: Selection, dataset: str, m
     ours = mean(picked.of(line, dataset, metric))
     if ours is None:
         return EMPTY
-    theirs = published_value(entry, line, dataset, metric, family)
+    theirs = published(entry, line, dataset, metric, family)
     if theirs is None:
         return number(ours, metric)
-    return f"{number(ours, metric)} (paper {number(theirs, metric)}, {_signed(ours - theirs, DIGITS.get(metric, 3))})"
+    return f"{number(ours, metric)} (paper {number(theirs.value, metric)}, {signed(ours - theirs.value, metric)})"
 
 
-def published_value(entry: Experiment, line: Line, dataset: str, metric: str, family: str | None) -> float | None:
+def published(entry: Experiment, line: Line, dataset: str, metric: str, family: str | None) -> Printed | None:
     """The paper's number for a line, for a model of the published family; None where it has none."""
     if entry.paper is None or family not in FAMILIES or not line.paper:
         return None
@@ -310,7 +315,7 @@ def published_value(entry: Experiment, line: Line, dataset: str, metric: str, fa
     table = paper_table(entry.paper)
     if "model" in table.rows[0]:
         fields["model"] = family
-    return table.value(fields, Cell(dataset, metric, family))
+    return table.printed(fields, Cell(dataset, metric, family))
 
 
 def _difference_row(
