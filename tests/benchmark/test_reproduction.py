@@ -187,12 +187,16 @@ def miniature(monkeypatch, tmp_path, one_thread):
     """The four datasets in their published layout, a few frames each, and a tiny DA3 with weights in a file."""
     data = tmp_path / "data"
     shutil.copytree(fixture_path("benchmark", "datasets"), data)
-    monkeypatch.setattr(eth3d, "SCENES", ("delivery_area", "pipes"))
+    monkeypatch.setattr(eth3d, "SCENES", ("pipes",))
     monkeypatch.setattr(sevenscenes, "SCENES", ("stairs",))
     monkeypatch.setattr(scannetpp, "SCENES", ("09c1414f1b",))
+    (data / "hiroom" / "selected_scene_list_val.txt").write_text("20241230/000001/cam_sampled_00\n")
     for name in PAPER_DATASETS:
-        plain = registry.DATASETS[name]
-        monkeypatch.setitem(registry.DATASETS, name, replace(plain, constants=replace(plain.constants, samples=5000)))
+        plain = registry.DATASETS[name].constants
+        coarse = replace(
+            plain, samples=5000, voxel=4 * plain.voxel, truncation=4 * plain.truncation, down_sample=4 * plain.voxel
+        )
+        monkeypatch.setitem(registry.DATASETS, name, replace(registry.DATASETS[name], constants=coarse))
     for name in registry.scene_names(data, "hiroom"):
         scene = registry.load_scene(data, "hiroom", name)
         depth = registry.true_depth(scene, scene.photos[0].size_hw)
@@ -203,7 +207,7 @@ def miniature(monkeypatch, tmp_path, one_thread):
         return DA3(replace(ANY_VIEW), replace(spec, adaptation=replace(spec.adaptation, published="da3")))
 
     weights = tmp_path / "tiny.safetensors"
-    save_file({name: value.contiguous() for name, value in tiny_da3().state_dict().items()}, weights)
+    save_file({name: value.clone() for name, value in tiny_da3().state_dict().items()}, weights)
     item = ModelEntry(
         name="tiny-da3", about="a test", licence="none", parameters=1, build=build, packaged_weights=weights
     )
