@@ -5,7 +5,6 @@ which depends on no model, view count or frame seed, so it can be reused.
 """
 
 import hashlib
-import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,8 +21,6 @@ from freegeo.fusion.tsdf import TsdfVolume
 from freegeo.metrics.cloud import CloudScore, ReferenceCloud
 from freegeo.metrics.pose import score_poses
 from freegeo.types import Prediction
-
-logger = logging.getLogger(__name__)
 
 GROUND_TRUTH = "ground-truth"
 """Folder of prepared ground-truth points in a benchmark folder."""
@@ -133,7 +130,6 @@ def score_scene_surface(
     mesh = fuse_scene(scene, prediction, posed=posed, device=device)
     samples = reference.constants.samples
     if mesh.is_empty:
-        logger.warning("The fusion of %s gave no surface; random points are scored, as published.", scene.name)
         points = empty_mesh_substitute(samples)
     else:
         points = sample_surface(mesh, samples, seed=seed)

@@ -431,13 +431,13 @@ def _reproduction(
     if bench.frames is not None:
         doubts.append(f"The frames were chosen by the rule {bench.frames} on request.")
     if problems:
-        doubts.append(f"{len(problems)} parts failed; they are listed below, and their cells are not marked.")
+        doubts.append(f"{len(problems)} parts failed and are listed below; means that lack them are not marked.")
     loaded, compute = predictor.model.loaded_from, predictor.compute
     facts = (
         ("model", name),
         ("weights", f"{loaded.file}, fingerprint {loaded.fingerprint}" if loaded else "unknown"),
         ("recipe", f"{recipe.recipe}, one adapter per {predictor.setup.adapt_per}, seed {model.seed}"),
-        ("datasets", ", ".join(f"{dataset} ({len(own)} scenes)" for dataset, own in scenes.items())),
+        ("datasets", ", ".join(f"{dataset} (scenes: {len(own)})" for dataset, own in scenes.items())),
         ("device", f"{_device(compute.device)}, predictions in {compute.precision}"),
         ("versions", ", ".join(f"{package} {version}" for package, version in versions().items())),
         ("finished", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
