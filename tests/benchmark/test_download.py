@@ -192,10 +192,14 @@ def test_a_download_that_broke_off_continues_where_it_was(get, hub, monkeypatch,
     assert not part.exists()
 
 
-def test_a_part_of_another_version_of_the_archive_is_not_continued(get, hub, tmp_path):
-    (tmp_path / "data").mkdir()
+def test_what_a_killed_command_left_is_removed_and_a_part_of_another_version_is_not_continued(get, hub, tmp_path):
+    left = tmp_path / "data" / ".eth3d.00000000.part" / "eth3d" / "pipes"
+    left.mkdir(parents=True)
+    (left / "combined_mesh.ply").write_bytes(b"half of")
     (tmp_path / "data" / "eth3d.zip.0123456789ab.part").write_bytes(b"other")
     assert get("eth3d")[0] == 0
+    assert files_below(tmp_path / "data" / "eth3d") == PIPES
+    assert not list((tmp_path / "data").glob(".*.part"))
     assert [int(line.split()[-1]) for line in hub.asked if line.startswith("GET")] == [0]
 
 
