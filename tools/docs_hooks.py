@@ -17,6 +17,8 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).parents[1]
 PAGES = {"CHANGELOG.md": "changelog.md", "README.md": "index.md"}
 """Pages of the repository that have a page of their own on the site."""
+WIDE = ("index.md", "api.md")
+"""Pages without a sidebar for navigation, which would hold nothing but their name."""
 LINK = re.compile(r"(?<=\]\()([^()\s#:]+)((?:#[^()\s]*)?)(?=\))")
 FENCED = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 LANGUAGES = {".py": "python", ".toml": "toml", ".md": "markdown", "": "text"}
@@ -41,6 +43,8 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Let the links of a page lead to pages of the site."""
     here = page.file.src_uri
+    if here in WIDE:
+        page.meta["hide"] = ["navigation"]
     if here.startswith("source/"):
         return markdown
     origin = next((path for path, site in PAGES.items() if site == here and site == "changelog.md"), f"docs/{here}")
