@@ -24,6 +24,10 @@ QUOTED = re.compile(r"^\*\*`(.+?)`\*\*", re.MULTILINE)
 DIRECTIVE = re.compile(r"^::: ([\w.]+)", re.MULTILINE)
 
 
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
 @cache
 def program() -> cyclopts.App:
     return build()
@@ -32,7 +36,8 @@ def program() -> cyclopts.App:
 def commands(page: Path) -> list[tuple[str, bool]]:
     """Return the command lines of freegeo on a page, and whether each is in a block of code and thus complete."""
     text = page.read_text(encoding="utf-8")
-    lines = [line.removeprefix("$ ") for block in BLOCK.findall(text) for line in block.replace("\\\n", " ").splitlines()]
+    blocks = "".join(BLOCK.findall(text)).replace("\\\n", " ")
+    lines = [line.removeprefix("$ ") for line in blocks.splitlines()]
     inline = [" ".join(line.split()) for line in INLINE.findall(text)]
     return [(line, True) for line in lines if line.startswith("freegeo ")] + [
         (line, False) for line in inline if "..." not in line
@@ -90,7 +95,7 @@ def model_table():
     return module
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=name_of)
 def test_commands_are_those_that_freegeo_has(page):
     assert not [wrong for line, complete in commands(page) if (wrong := is_wrong(line, complete))]
 

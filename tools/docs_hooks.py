@@ -1,11 +1,11 @@
 """A hook of mkdocs: pages link to files of the repository as on a forge, and the site has pages that show these files.
 
-`docs/guard.md` says `[files.py](../src/freegeo/files.py)`. The site gets a page with that file, and the link leads there.
+`docs/reliability.md` links to `../src/freegeo/files.py`. The site gets a page with that file, and the link leads there.
 """
 
 from __future__ import annotations
 
-import os.path
+import posixpath
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -47,13 +47,13 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
         page.meta["hide"] = ["navigation"]
     if here.startswith("source/"):
         return markdown
-    origin = next((path for path, site in PAGES.items() if site == here and site == "changelog.md"), f"docs/{here}")
+    origin = "CHANGELOG.md" if here == PAGES["CHANGELOG.md"] else f"docs/{here}"
 
     def replace(link: re.Match) -> str:
         target = resolved(origin, link[1])
         if target.startswith("docs/") and origin.startswith("docs/"):
             return link[0]
-        return os.path.relpath(site_path(target), os.path.dirname(here) or ".") + link[2]
+        return posixpath.relpath(site_path(target), posixpath.dirname(here) or ".") + link[2]
 
     return "".join(part if part.startswith("```") else LINK.sub(replace, part) for part in FENCED.split(markdown))
 
@@ -67,7 +67,7 @@ def targets(origin: str, text: str) -> Iterator[str]:
 
 def resolved(origin: str, link: str) -> str:
     """Return where a relative link of a file leads, as a path in the repository."""
-    return os.path.normpath(os.path.join(os.path.dirname(origin), link))
+    return posixpath.normpath(posixpath.join(posixpath.dirname(origin), link))
 
 
 def site_path(target: str) -> str:

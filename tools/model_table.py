@@ -1,4 +1,4 @@
-"""The table of docs/choosing-a-model.md, from the catalog and the memory planner: `python tools/model_table.py --write`."""
+"""The table of docs/choosing-a-model.md, from catalog and memory planner: `python tools/model_table.py --write`."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from freegeo.models.spec import ModelEntry, ModelSpec
 
 PAGE = Path(__file__).parents[1] / "docs" / "choosing-a-model.md"
 PLACE = re.compile(r"(<!-- made by tools/model_table\.py -->\n\n)(.*?)(\n\n<!-- end -->)", re.DOTALL)
-HEADER = (
-    "model", "licence of the weights", "download", *(f"{views} photos" for views in VIEWS), "to adapt", "takes", "gives",
-)  # fmt: skip
+MEMORY = tuple(f"{views} photos" for views in VIEWS)
+HEADER = ("model", "licence of the weights", "download", *MEMORY, "to adapt", "takes", "gives")
 
 
 def entries() -> list[ModelEntry]:
