@@ -108,6 +108,10 @@ def test_wrong_commands_are_found():
     assert is_wrong("freegeo run photos/")
 
 
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 120
+
+
 def test_errors_that_are_explained_exist():
     quoted = QUOTED.findall((DOCS / "troubleshooting.md").read_text(encoding="utf-8"))
     assert len(quoted) >= 20

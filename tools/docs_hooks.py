@@ -80,10 +80,10 @@ def shown(path: Path) -> str:
     name = path.relative_to(ROOT).as_posix()
     files = sorted(child for child in path.rglob("*") if child.is_file()) if path.is_dir() else [path]
     files = [file for file in files if not re.search(r"__pycache__|egg-info", file.as_posix())]
-    parts = [f"---\nsearch: {{exclude: true}}\n---\n\n# {name}\n"]
+    parts = [f"---\nsearch: {{exclude: true}}\nhide: [navigation, toc]\n---\n\n# `{name}`\n"]
     for file in files:
         if path.is_dir():
-            parts.append(f"## {file.relative_to(path).as_posix()}\n")
+            parts.append(f"## `{file.relative_to(path).as_posix()}`\n")
         language = LANGUAGES.get(file.suffix)
         parts.append(
             f"`````{language}\n{file.read_text(encoding='utf-8')}\n`````\n" if language else "A file of numbers.\n"
