@@ -39,7 +39,8 @@ def row(item: ModelEntry) -> tuple[str, ...]:
 
 def takes(spec: ModelSpec) -> str:
     """Return what a model is given."""
-    return "photos, known cameras" if spec.takes == "cameras" else "photos" if spec.cameras else "photos one by one"
+    known = {"nothing": "", "cameras": ", cameras of all", "parts": ", cameras and depth of some"}
+    return f"photos{known[spec.takes]}" if spec.cameras else "photos one by one"
 
 
 def gives(spec: ModelSpec) -> str:
