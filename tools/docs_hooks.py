@@ -21,7 +21,7 @@ WIDE = ("index.md", "api.md")
 """Pages without a sidebar for navigation, which would hold nothing but their name."""
 LINK = re.compile(r"(?<=\]\()([^()\s#:]+)((?:#[^()\s]*)?)(?=\))")
 FENCED = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
-LANGUAGES = {".py": "python", ".toml": "toml", ".md": "markdown", "": "text"}
+LANGUAGES = {".py": "python", ".toml": "toml", ".md": "markdown", ".json": "json", ".sh": "bash", "": "text"}
 """Endings of the files that are shown; others are only named."""
 
 
@@ -86,6 +86,8 @@ def shown(path: Path) -> str:
             parts.append(f"## `{file.relative_to(path).as_posix()}`\n")
         language = LANGUAGES.get(file.suffix)
         parts.append(
-            f"`````{language}\n{file.read_text(encoding='utf-8')}\n`````\n" if language else "A file of numbers.\n"
+            f"`````{language}\n{file.read_text(encoding='utf-8')}\n`````\n"
+            if language
+            else "Not shown here; the file is in the repository.\n"
         )
     return "\n".join(parts)
