@@ -21,6 +21,8 @@ WIDE = ("index.md", "api.md")
 """Pages without a sidebar for navigation, which would hold nothing but their name."""
 LINK = re.compile(r"(?<=\]\()([^()\s#:]+)((?:#[^()\s]*)?)(?=\))")
 FENCED = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
+LIST = re.compile(r"^((?![-*|>#\s]|\d+\. )\S.*\n)(?=[-*] |1\. )", re.MULTILINE)
+"""A line of text before a list: on a forge no blank line is needed between them."""
 LANGUAGES = {".py": "python", ".toml": "toml", ".md": "markdown", ".json": "json", ".sh": "bash", "": "text"}
 """Endings of the files that are shown; others are only named."""
 
@@ -55,7 +57,8 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
             return link[0]
         return posixpath.relpath(site_path(target), posixpath.dirname(here) or ".") + link[2]
 
-    return "".join(part if part.startswith("```") else LINK.sub(replace, part) for part in FENCED.split(markdown))
+    parts = FENCED.split(markdown)
+    return "".join(part if part.startswith("```") else LIST.sub(r"\1\n", LINK.sub(replace, part)) for part in parts)
 
 
 def targets(origin: str, text: str) -> Iterator[str]:
