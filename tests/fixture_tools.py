@@ -30,5 +30,7 @@ def relative_error(actual, expected) -> float:
     actual, expected = (torch.as_tensor(values).detach().cpu().double() for values in (actual, expected))
     if actual.shape != expected.shape or not torch.equal(actual.isnan(), expected.isnan()):
         return float("inf")
+    if not expected.numel():
+        return 0.0
     difference = (actual - expected).nan_to_num(nan=0.0).abs().max()
     return float(difference / expected.nan_to_num(nan=0.0).abs().max().clamp(min=1e-300))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fixture_tools import FIXTURES
 
-SUBFOLDERS = ("da3", "vggt", "pi3", "losses", "benchmark")
+SUBFOLDERS = ("da3", "vggt", "pi3", "mapanything", "losses", "benchmark")
 
 
 def run(root: Path) -> int:

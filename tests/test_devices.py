@@ -28,7 +28,18 @@ from freegeo.training.config import TrainConfig
 from freegeo.training.loop import train
 from freegeo.types import ImageBatch, Priors
 from pretend_device import MixedDevicesError, NoFloat64Error, PretendDevice
-from tiny_models import noise, noise_scene, quick, tensors, tiny_da3, tiny_nested, tiny_pi3, tiny_pi3x, tiny_vggt
+from tiny_models import (
+    noise,
+    noise_scene,
+    quick,
+    tensors,
+    tiny_da3,
+    tiny_mapanything,
+    tiny_nested,
+    tiny_pi3,
+    tiny_pi3x,
+    tiny_vggt,
+)
 
 ONCE_A_RUN = {
     "adaptation/adapt.py:_train",  # the model moves to the device
@@ -121,7 +132,7 @@ def test_a_device_without_float64_refuses_it():
 
 
 @pytest.mark.parametrize("device", ["cuda", "mps"])
-@pytest.mark.parametrize("make", [tiny_da3, tiny_vggt, tiny_pi3, tiny_pi3x])
+@pytest.mark.parametrize("make", [tiny_da3, tiny_vggt, tiny_pi3, tiny_pi3x, tiny_mapanything])
 @torch.no_grad()
 def test_a_prediction_stays_on_its_device(make, device):
     images, rule = noise(4), "saddle_balanced" if make is tiny_da3 else "first"
@@ -136,7 +147,7 @@ def test_a_prediction_stays_on_its_device(make, device):
     with pretended(device)() as pretend:
         model = make().to(device)
         tokens, found = predicted(model, pretend.device)
-        if make in (tiny_da3, tiny_pi3x):
+        if make in (tiny_da3, tiny_pi3x, tiny_mapanything):
             priors = Priors(T_cam_world=found.T_cam_world.cpu(), K=found.K.cpu())
             model.aggregate(tokens, priors=priors)
         pretend.waits.clear()
@@ -162,6 +173,7 @@ RUNS = {
     "VGGT, released losses": (tiny_vggt, "cuda", "fp32", {"loss": asdict(recipes.RELEASED_VGGT.loss)}),
     "Pi3, activations computed twice": (tiny_pi3, "cuda", "bf16", {"hold": 1.0}),
     "DA3 on Apple's GPU": (tiny_da3, "mps", "fp32", {"hold": 1.0}),
+    "MapAnything, bf16": (tiny_mapanything, "cuda", "bf16", {}),
 }
 
 

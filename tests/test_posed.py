@@ -12,6 +12,7 @@ from PIL import Image
 import freegeo
 from evidence_tools import exact_matches, without_matches
 from exact_rooms import room
+from freegeo.adaptation.adapt import adapt
 from freegeo.adaptation.samples import Samples, SceneImages
 from freegeo.adaptation.state import UNFINISHED_FILE
 from freegeo.adaptation.views import schedule
@@ -25,6 +26,7 @@ from freegeo.geometry.rotation import quat_xyzw_to_matrix
 from freegeo.geometry.se3 import camera_centres, from_Rt
 from freegeo.geometry.sim3 import DegenerateAlignmentError, Sim3, fit_cameras
 from freegeo.models.precision import Compute
+from freegeo.models.priors import usable_by_both
 from freegeo.posed import (
     digest,
     doubt_focal_length,
@@ -36,7 +38,18 @@ from freegeo.posed import (
     with_known_cameras,
     with_measured_depth,
 )
-from tiny_models import attach, noise, quick, same, tensors, tiny_da3, tiny_nested, tiny_single_view, tiny_vggt
+from tiny_models import (
+    attach,
+    noise,
+    quick,
+    same,
+    tensors,
+    tiny_da3,
+    tiny_mapanything,
+    tiny_nested,
+    tiny_single_view,
+    tiny_vggt,
+)  # fmt: skip
 
 VIEWS = 5
 FACTOR = 0.37
@@ -274,6 +287,32 @@ def test_models_say_what_they_are_told(photos):
         assert (priors is not None) == given and words in sentence
 
 
+def test_a_model_that_takes_parts_says_which_ones(photos):
+    model = tiny_mapanything()
+    batch, known = model.preprocess(photos), known_for(photos)
+
+    def without_poses(*views):
+        cameras = [KnownCamera(K=c.K) if i in views else c for i, c in enumerate(known.cameras)]
+        return replace(known, cameras=tuple(cameras))
+
+    all_but_first = range(1, VIEWS)
+    alone = without_poses(*all_but_first)
+    cases = [
+        (known, True, "is told the cameras of a file."),
+        (without_poses(2), True, f"a file: poses of {VIEWS - 1} and intrinsics of {VIEWS} photos."),
+        (without_poses(0), False, f"a file: intrinsics of {VIEWS} photos. tiny-mapanything takes poses relative to the "
+         "first photo, whose own is not known: poses are left out."),
+        (alone, False, "only one is known: poses are left out."),
+    ]  # fmt: skip
+    for cameras, posed, words in cases:
+        priors, sentence = told(cameras, batch, model.spec)
+        assert (priors.T_cam_world is not None) == posed and words in sentence
+    one = KnownCamera(T_cam_world=known.cameras[0].T_cam_world)
+    nothing = replace(known, cameras=(one, *[KnownCamera()] * (VIEWS - 1)))
+    priors, sentence = told(nothing, batch, model.spec)
+    assert priors is None and "sees the photos alone. The cameras of a file have no part" in sentence
+
+
 def test_reconstruct_tells_the_model_and_returns_the_given_cameras(photos, caplog):
     caplog.set_level(logging.INFO, "freegeo")
     model, known = tiny_da3(), known_for(photos)
@@ -323,6 +362,19 @@ def test_teacher_and_student_are_told_the_cameras_of_their_views(photos, hold):
         chosen = [frames[k] for k in kept]
         assert torch.equal(sample.student_priors().T_cam_world, scene.priors.T_cam_world[:, chosen])
     samples.close()
+
+
+def test_teacher_and_student_are_told_the_same(photos):
+    model = tiny_mapanything()
+    priors = priors_of(known_for(photos), model.preprocess(photos))
+    for posed, kept, used in (((0, 1), (0, 2, 4), False), ((0, 2), (0, 2, 4), True), ((1, 2), (0, 2), False)):
+        some = replace(priors, has_pose=torch.tensor([view in posed for view in range(VIEWS)]))
+        found = usable_by_both(some, kept, model.spec)
+        assert (found.T_cam_world is not None) == used and torch.equal(found.K, priors.K)
+        assert used or usable_by_both(replace(some, K=None), kept, model.spec) is None
+    # A student that would see one pose of the set is adapted all the same.
+    scene = replace(SceneImages.from_batch("s", model.preprocess(photos)), priors=some)
+    assert adapt(model, [scene], quick(model, views=4, steps=1), seed=1).trouble is None
 
 
 def test_an_adapter_trained_with_cameras_is_another_one_and_says_so(photos, tmp_path):

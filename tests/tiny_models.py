@@ -4,14 +4,18 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.recipe import Recipe, scene
 from freegeo.adaptation.samples import SceneImages
+from freegeo.geometry.camera import pixel_grid
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.da3 import DA3
 from freegeo.models.da3_config import DA3Config
 from freegeo.models.da3_metric import DA3Nested, DA3SingleView
+from freegeo.models.mapanything import MapAnything
+from freegeo.models.mapanything_config import MapAnythingConfig
 from freegeo.models.pi3 import Pi3
 from freegeo.models.pi3_config import Pi3Config, Pi3XConfig
 from freegeo.models.pi3_config import build as build_pi3
@@ -80,6 +84,36 @@ def tiny_pi3x(seed: int = 0, name: str = "tiny-pi3x") -> Pi3:
     """The same with metres, and known poses, intrinsics and depth."""
     spec = _spec(name, (PI3X.readout,), special=PI3X.registers, reference=NO_REFERENCE, takes="parts", metric=True)
     return randomise(build_pi3(PI3X, spec), seed)
+
+
+def tiny_mapanything(seed: int = 0, name: str = "tiny-mapanything") -> MapAnything:
+    """Two encoder blocks and six blocks across views, width 32; its rays are roughly those of a camera."""
+    config = MapAnythingConfig(
+        width=32, heads=2, encoder_depth=2, depth=6, out_layers=(1, 3, 5), dense_encoder=(8, 8, 8),
+        global_encoder=(8, 8, 8), head_features=16, head_channels=(4, 8, 8, 8), pose_hidden=16, scale_hidden=8,
+        patch_size=PATCH, position_grid=4,
+    )  # fmt: skip
+    spec = _spec(name, config.out_layers, special=1, metric=True, takes="parts")
+    model = randomise(MapAnything(config, spec), seed)
+    if model.scale_token.is_meta:
+        return model
+    with torch.no_grad():
+        model.encoder["model"].pos_embed *= 20
+    features = model.aggregate(model.embed(torch.stack([noise(2, scene) for scene in range(8)])))
+    last = model.dense_head[1].conv2[2]
+    seen: list[Tensor] = []
+    hook = last.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
+    levels = [level.flatten(0, 1) for level in model.dense_levels(features)]
+    image_hw = model.dense(levels, features.grid_hw).shape[-2:]
+    hook.remove()
+    hidden = F.pad(seen[0].movedim(1, -1), (0, 1), value=1.0).flatten(0, 2)
+    wanted = (pixel_grid(image_hw, like=hidden)[..., :2] / image_hw[0] - 0.5).expand(16, *image_hw, 2).flatten(0, 2)
+    with torch.no_grad():
+        weights = torch.linalg.lstsq(hidden, wanted).solution
+        last.weight[:3], last.bias[:3] = 0, torch.tensor([*weights[-1], 1.0])
+        last.weight[:2, :, 0, 0] = weights[:-1].T
+        last.bias[5] = 3.0
+    return model
 
 
 def randomise(model: nn.Module, seed: int) -> nn.Module:

@@ -28,7 +28,7 @@ from freegeo.export.pixels import HALF
 from freegeo.export.reconstruction import Reconstruction, Scale
 from freegeo.geometry.se3 import camera_centres
 from freegeo.geometry.sim3 import NORMAL, CameraFit, DegenerateAlignmentError, fit_cameras
-from freegeo.models.priors import unusable
+from freegeo.models.priors import usable
 from freegeo.models.spec import ModelSpec
 from freegeo.types import ImageBatch, PhotoLike, Priors
 
@@ -136,14 +136,23 @@ def priors_of(known: KnownCameras, batch: ImageBatch) -> Priors:
 
 
 def told(known: KnownCameras | None, batch: ImageBatch, spec: ModelSpec) -> tuple[Priors | None, str | None]:
-    """Return what a model is told of known cameras, and a sentence about that; (None, None) without any."""
+    """Return what a model is told of known cameras, and what to say about that; (None, None) without any."""
     if known is None:
         return None, None
-    priors = priors_of(known, batch)
-    reason = unusable(priors, spec)
-    if reason is None:
-        return priors, f"{spec.name} is told the cameras of {known.source}."
-    return None, f"{reason} The cameras of {known.source} have no part in its prediction."
+    priors, left_out = usable(priors_of(known, batch), spec)
+    if priors is None:
+        return None, f"{left_out} The cameras of {known.source} have no part in its prediction."
+    sentence = f"{spec.name} is told the cameras of {known.source}{_parts_of(priors)}."
+    return priors, f"{sentence} {left_out}" if left_out else sentence
+
+
+def _parts_of(priors: Priors) -> str:
+    """Say of how many photos which part is known, where that is not everything of all."""
+    if priors.whole_cameras:
+        return ""
+    masks = (("poses", priors.T_cam_world, priors.has_pose), ("intrinsics", priors.K, priors.has_K))
+    parts = [f"{name} of {int(mask.sum())}" for name, values, mask in masks if values is not None and mask is not None]
+    return f": {' and '.join(parts)} photos"
 
 
 def model_K(known: KnownCameras, scale_xy: Tensor, offset_xy: Tensor) -> Tensor:

@@ -25,7 +25,19 @@ from freegeo.adaptation.views import chunk_windows, schedule
 from freegeo.errors import DivergedError, FreeGeoError, UserError
 from freegeo.models.precision import Compute
 from loss_tools import teacher_side
-from tiny_models import PATCH, noise, noise_scene, outputs, quick, same, tensors, tiny_da3, tiny_pi3, tiny_vggt
+from tiny_models import (
+    PATCH,
+    noise,
+    noise_scene,
+    outputs,
+    quick,
+    same,
+    tensors,
+    tiny_da3,
+    tiny_mapanything,
+    tiny_pi3,
+    tiny_vggt,
+)
 
 IMAGES = noise(4)
 MODELS = {"da3": tiny_da3, "vggt": tiny_vggt}
@@ -108,6 +120,7 @@ def plain_adaptation(model, scenes, recipe, seed=42):
 CASES = {
     "da3-scene": (tiny_da3, lambda model: quick(model, steps=5)),
     "vggt-scene": (tiny_vggt, lambda model: quick(model, steps=5)),
+    "mapanything-scene": (tiny_mapanything, lambda model: quick(model, steps=3)),
     "da3-batch": (tiny_da3, lambda model: quick(model, epochs=2, batch=3)),
     "vggt-hold-batch": (tiny_vggt, lambda model: quick(model, epochs=2, batch=2, hold=0.5)),
     "da3-dropout-hold": (tiny_da3, lambda model: quick(model, steps=4, dropout=0.1, hold=1.0)),

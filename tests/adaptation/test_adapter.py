@@ -6,10 +6,10 @@ from torch import nn
 
 from freegeo.adaptation.adapter import count_trainable, is_adapted
 from freegeo.errors import UserError
-from freegeo.models import da3_config, vggt_config
+from freegeo.models import da3_config, mapanything_config, vggt_config
 from freegeo.models.catalog import build_empty
 from freegeo.models.checkpoints import load_weights, save_weights
-from tiny_models import attach, noise, outputs, same, tiny_da3, tiny_vggt, trained
+from tiny_models import attach, noise, outputs, same, tiny_da3, tiny_mapanything, tiny_vggt, trained
 
 IMAGES = noise(4)
 # docs/method.md, "Adapter files".
@@ -17,9 +17,10 @@ GIANT_COUNTS = {8: 5_311_488, 16: 10_619_904, 32: 21_236_736, 64: 42_470_400}
 VGGT_COUNTS = {8: 6_293_504, 16: 12_584_960, 32: 25_167_872, 64: 50_333_696}
 
 
-@pytest.fixture(params=["da3", "da3-swiglu", "vggt"])
+@pytest.fixture(params=["da3", "da3-swiglu", "vggt", "mapanything"])
 def model(request):
-    return {"da3": tiny_da3, "da3-swiglu": lambda: tiny_da3(ffn="swiglu"), "vggt": tiny_vggt}[request.param]()
+    build = {"da3": tiny_da3, "vggt": tiny_vggt, "mapanything": tiny_mapanything}
+    return (build | {"da3-swiglu": lambda: tiny_da3(ffn="swiglu")})[request.param]()
 
 
 def test_a_fresh_adapter_leaves_every_output_bit_identical(model):
@@ -41,9 +42,8 @@ def test_a_fresh_adapter_starts_as_published(model):
 
 def again(model):
     """Build the same tiny model again."""
-    if model.spec.name == "tiny-vggt":
-        return tiny_vggt()
-    return tiny_da3(ffn=model.config.ffn)
+    others = {"tiny-vggt": tiny_vggt, "tiny-mapanything": tiny_mapanything}
+    return others[model.spec.name]() if model.spec.name in others else tiny_da3(ffn=model.config.ffn)
 
 
 def test_what_trains_is_the_adapter_and_the_camera_token(model):
@@ -52,8 +52,9 @@ def test_what_trains_is_the_adapter_and_the_camera_token(model):
     training = {name for name, parameter in model.named_parameters() if parameter.requires_grad}
     named = adapter.named_parameters()
     lora = {name.replace(".weight", ".default.weight") for name in named if name != "camera_token"}
-    assert training == lora | {model.camera_token_name}
-    assert model.get_parameter(model.camera_token_name) is named["camera_token"]
+    token = model.camera_token_name
+    assert training == (lora | {token} if token else lora)
+    assert named.get("camera_token") is (model.get_parameter(token) if token else None)
     assert sorted(adapter.layers) == sorted(targets)
     assert sum(p.numel() for p in adapter.parameters()) == count_trainable(again(model), 4)
 
@@ -74,7 +75,7 @@ def test_off_is_the_frozen_model_and_nothing_is_forgotten(model):
     adapter = trained(model)
     adapted = outputs(model, IMAGES)
     assert not same(adapted, before)
-    flags = [True, False] * (len(adapter.parameters()) // 2) + [True]
+    flags = [number % 2 == 0 for number in range(len(adapter.parameters()))]
     for parameter, flag in zip(adapter.parameters(), flags, strict=True):
         parameter.requires_grad_(flag)
         parameter.grad = torch.ones_like(parameter)
@@ -84,7 +85,8 @@ def test_off_is_the_frozen_model_and_nothing_is_forgotten(model):
     assert same(outputs(model, IMAGES), adapted)
     assert [parameter.requires_grad for parameter in adapter.parameters()] == flags
     assert all((parameter.grad == 1).all() for parameter in adapter.parameters())
-    assert model.get_parameter(model.camera_token_name) is adapter.camera_token
+    token = model.camera_token_name
+    assert adapter.camera_token is (model.get_parameter(token) if token else None)
 
 
 def test_off_ends_when_its_block_fails():
@@ -111,7 +113,8 @@ def test_strength_goes_from_frozen_to_adapted_without_a_jump(model):
     assert (depth[0.501] - depth[0.499]).abs().max() < 0.05 * whole
     assert (depth[1.0] - depth[0.999]).abs().max() < 0.05 * whole
     assert (depth[0.5] - depth[0.0]).abs().max() > 0.05 * whole
-    assert model.get_parameter(model.camera_token_name) is adapter.camera_token
+    token = model.camera_token_name
+    assert adapter.camera_token is (model.get_parameter(token) if token else None)
 
 
 def test_the_frozen_token_follows_a_model_that_is_moved(model):
@@ -157,7 +160,10 @@ def test_merging_at_a_strength_keeps_that_strength():
         torch.testing.assert_close(found, target, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize(("build", "keys"), [(tiny_da3, da3_config.KEYS), (tiny_vggt, vggt_config.KEYS)])
+@pytest.mark.parametrize(
+    ("build", "keys"),
+    [(tiny_da3, da3_config.KEYS), (tiny_vggt, vggt_config.KEYS), (tiny_mapanything, mapanything_config.KEYS)],
+)
 def test_merged_weights_go_through_a_checkpoint_file(tmp_path, build, keys):
     model = build()
     adapter = trained(model)

@@ -1,6 +1,7 @@
 """The camera term: what changes it and what does not, where its gradient goes, and runs that learn from it."""
 
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from freegeo.errors import UserError
 from freegeo.geometry.rotation import quat_xyzw_to_matrix
 from freegeo.geometry.se3 import from_Rt
 from freegeo.models.precision import Compute
-from tiny_models import noise_scene, quick, same, tensors, tiny_da3, tiny_vggt
+from tiny_models import noise_scene, quick, same, tensors, tiny_da3, tiny_mapanything, tiny_vggt
 
 VIEWS = 6
 WEIGHTS = {"cameras": 1.0, "features": 0.0}
@@ -105,8 +106,7 @@ def test_the_gradient_is_finite_where_the_loss_is_zero_and_points_down_elsewhere
 # Runs -----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("build", MODELS)
-@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize(("build", "precision"), [*product(MODELS, ("fp32", "bf16")), (tiny_mapanything, "fp32")])
 def test_the_adapter_learns_the_cameras_and_nothing_else_changes(build, precision):
     model = build()
     frozen = {name: p.detach().clone() for name, p in model.named_parameters()}

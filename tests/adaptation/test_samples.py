@@ -16,7 +16,7 @@ from freegeo.adaptation.views import schedule
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.models.api import embed_in_chunks
 from freegeo.models.precision import Compute
-from tiny_models import attach, noise, noise_scene, quick, tiny_da3, tiny_vggt
+from tiny_models import attach, noise, noise_scene, quick, tiny_da3, tiny_mapanything, tiny_vggt
 
 CPU = torch.device("cpu")
 
@@ -37,7 +37,7 @@ def recorded_scene(calls, views=9):
     return SceneImages(name="recorded", count=views, load=load)
 
 
-@pytest.mark.parametrize("build", [tiny_da3, tiny_vggt])
+@pytest.mark.parametrize("build", [tiny_da3, tiny_vggt, tiny_mapanything])
 @pytest.mark.parametrize("hold", [0.0, 1.0])
 @pytest.mark.parametrize("place", ["device", "disk"])
 def test_a_sample_is_the_frozen_model_s_view_of_its_set(build, hold, place, tmp_path):

@@ -325,7 +325,11 @@ def test_models_fit_a_terminal_and_name_every_licence(freegeo):
 
 @pytest.mark.parametrize(
     ("name", "counts"),
-    [("da3-giant", ("5,311,488", "10,619,904", "21,236,736", "42,470,400")), ("freegeo-tiny", ("embedded",))],
+    [
+        ("da3-giant", ("5,311,488", "10,619,904", "21,236,736", "42,470,400", "takes: photos, and the poses together")),
+        ("freegeo-tiny", ("embedded",)),
+        ("map-anything", ("12,582,912", "lengths: metres", "takes: photos, and poses or intrinsics or both", "15\n")),
+    ],
 )
 def test_describe_counts_what_an_adapter_trains(freegeo, name, counts):
     outcome = freegeo("models", "describe", name)

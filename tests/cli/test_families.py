@@ -16,10 +16,10 @@ from freegeo.data.procedural import render, sample_rooms
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.models.checkpoints import save_weights
 from freegeo.models.spec import KeyRules
-from tiny_models import tiny_pi3, tiny_pi3x
+from tiny_models import tiny_mapanything, tiny_pi3, tiny_pi3x
 
 pytestmark = pytest.mark.slow
-BUILDS: dict[str, Callable] = {"tiny-pi3": tiny_pi3, "tiny-pi3x": tiny_pi3x}
+BUILDS: dict[str, Callable] = {"tiny-pi3": tiny_pi3, "tiny-pi3x": tiny_pi3x, "tiny-mapanything": tiny_mapanything}
 COUNT = 6
 TESTS = Path(__file__).parents[1]
 MILD = [*QUICK, "--lr", "1e-5"]

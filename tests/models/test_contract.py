@@ -1,4 +1,4 @@
-"""What holds for every reconstruction model here, on the small DA3 and the small VGGT with recorded weights."""
+"""What holds for every reconstruction model here, on small models with recorded weights."""
 
 import copy
 import sys
@@ -13,9 +13,11 @@ TESTS = Path(__file__).parents[1]
 sys.path.append(str(TESTS))  # the parity modules are shared with the full parity run and lie beside this folder
 
 import parity_da3  # noqa: E402
+import parity_mapanything  # noqa: E402
 import parity_vggt  # noqa: E402
 from fixture_tools import relative_error  # noqa: E402
 from freegeo.errors import UserError  # noqa: E402
+from freegeo.models.mapanything import MapAnything  # noqa: E402
 from freegeo.models.transformer import Block  # noqa: E402
 from freegeo.models.vggt import VGGT  # noqa: E402
 from freegeo.types import Features, ViewTokens  # noqa: E402
@@ -24,8 +26,9 @@ FIXTURES = TESTS / "fixtures"
 BUILDERS = {
     "da3": lambda: parity_da3.build(FIXTURES / "da3" / "tiny-mlp"),
     "vggt": lambda: parity_vggt.build(FIXTURES / "vggt" / "tiny-smallvar"),
+    "mapanything": lambda: parity_mapanything.build(FIXTURES / "mapanything" / "tiny-smallvar"),
 }
-LAST, MIDDLE = -1, 2
+LAST, MIDDLE = -1, -2
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -133,13 +136,13 @@ def test_layers_asked_for_alone_are_the_same(model):
     assert torch.equal(patch, wanted_patch) and torch.equal(special, wanted_special)
     rows, columns = features.grid_hw
     assert patch.shape[:3] == (1, 3, rows * columns)
-    assert special.shape[2] == model.spec.special_tokens
+    assert special.shape[2] == (model.spec.special_tokens if model.camera_token_name else 0)
 
 
 @torch.no_grad()
 def test_decoding_without_its_layers_says_which_are_missing(model):
     features = model.aggregate(model.embed(images(views=2)), layers=model.spec.loss_layers[:2])
-    with pytest.raises(UserError, match=r"lack \[\d+, \d+\]"):
+    with pytest.raises(UserError, match=r"lack \[\d+(, \d+)?\]"):
         model.decode(features)
 
 
@@ -173,7 +176,9 @@ def test_only_what_is_asked_for_is_decoded(model):
     assert depth.T_cam_world is depth.K is depth.rays is depth.points is None
     assert cameras.T_cam_world.shape == (1, 2, 4, 4) and cameras.K.shape == (1, 2, 3, 3)
     assert cameras.depth_z is cameras.conf is None
-    assert (depth.depth_z > 0).all() and (depth.conf > 1).all()
+    assert (depth.conf > 1).all()
+    # MapAnything measures along rays, which point anywhere with random weights.
+    assert (depth.depth_z > 0).all() or isinstance(model, MapAnything)
 
 
 @torch.no_grad()
@@ -193,7 +198,7 @@ def test_one_view_is_enough(model):
 def test_recomputing_blocks_changes_neither_features_nor_gradients(model):
     cross_view = next(m for m in model.modules() if hasattr(m, "recompute"))
     tokens = model.embed(images(views=3))
-    token = model.get_parameter(model.camera_token_name)
+    token = model.get_parameter(model.camera_token_name or f"{model.adapter_targets()[0]}.bias")
     results = []
     for recompute in (False, True):
         cross_view.recompute = recompute
@@ -205,7 +210,8 @@ def test_recomputing_blocks_changes_neither_features_nor_gradients(model):
     token.requires_grad_(False)
     assert torch.equal(results[0][0], results[1][0])
     assert relative_error(results[1][1], results[0][1]) <= 1e-5
-    assert results[0][1].abs().amax(dim=tuple(range(2, token.ndim))).min() > 0, "both learned tokens get a gradient"
+    largest = results[0][1].abs()
+    assert (largest.amax(dim=tuple(range(2, token.ndim))).min() if model.camera_token_name else largest.max()) > 0
 
 
 def test_adapter_targets_are_all_linears_of_the_cross_view_blocks(model):

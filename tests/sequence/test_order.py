@@ -12,7 +12,7 @@ from freegeo.evidence.dense import co_visible
 from freegeo.models.catalog import load_model
 from freegeo.models.precision import Compute
 from freegeo.sequence.order import descriptors, in_order, similarity_order
-from tiny_models import noise, tiny_da3, tiny_nested, tiny_single_view, tiny_vggt
+from tiny_models import noise, tiny_da3, tiny_mapanything, tiny_nested, tiny_single_view, tiny_vggt
 
 FRAMES = 20
 
@@ -52,7 +52,7 @@ def shuffled(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).permutation(count)
 
 
-@pytest.mark.parametrize("build", [tiny_da3, tiny_vggt, tiny_nested, tiny_single_view])
+@pytest.mark.parametrize("build", [tiny_da3, tiny_vggt, tiny_mapanything, tiny_nested, tiny_single_view])
 def test_every_model_describes_frames_by_unit_vectors(build):
     images = noise(3)
     found = descriptors(build(), [images[:2], images[2:]], Compute())

@@ -39,6 +39,7 @@ from freegeo.errors import UserError
 from freegeo.files import scratch_folder
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.precision import Compute
+from freegeo.models.priors import usable_by_both
 from freegeo.types import Features, ImageBatch, PhotoLike, Priors, ViewTokens
 
 Place = Literal["device", "disk"]
@@ -260,20 +261,22 @@ class Samples:
         """Run the teacher on the views of a set."""
         view_set, config, model = visit.view_set, self._recipe.loss, self._adapter.model
         tokens, priors = next(self._tokens), self._scenes[view_set.scene].priors
-        known = None if priors is None else priors.select(view_set.frames)
+        if priors is not None:
+            priors = usable_by_both(priors.select(view_set.frames), view_set.kept, model.spec)
         with self._adapter.off(), self._compute.autocast():
-            features = loss_features(model, tokens, known)
+            features = loss_features(model, tokens, priors)
         read = view_set.positions if self._recipe.sees_all else view_set.kept
         targets = self._scenes[view_set.scene].targets if self._recipe.cameras else None
         patches = seen_patches(self._scenes[view_set.scene], view_set, tokens.grid_hw, self._recipe)
         sample = Sample(
             tokens=tokens.select(read),
-            teacher=features.select(read),
+            # What only the decoder reads is not kept.
+            teacher=replace(features, extra={}).select(read),
             held_out=held_out_tokens(features.levels[max(features.levels)], view_set.kept, config, patches=patches),
             kept=tuple(read.index(position) for position in view_set.kept),
             patches=None if patches is None else patches[list(read)],
             targets=None if targets is None else targets.select([view_set.frames[position] for position in read]),
-            priors=None if known is None else known.select(read),
+            priors=None if priors is None else priors.select(read),
         )
         measured = self._recipe.features and config.uses_distances and config.pairing == "all"
         if self._compute.device.type == "cpu" or not measured:

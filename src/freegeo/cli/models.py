@@ -22,6 +22,11 @@ app = App(name="models", help="List, describe, download and check models.", help
 TABLE_WIDTH = 100
 RANKS = (8, 16, 32, 64)
 VIEWS = 8
+TAKES = {
+    "nothing": "photos alone; known cameras are used afterwards",
+    "cameras": "photos, and the poses together with the intrinsics of all of them",
+    "parts": "photos, and poses or intrinsics or both, of all of them or of some",
+}
 
 
 @app.default
@@ -123,6 +128,7 @@ def describe(model: str) -> None:
     console.say(memory)
     console.say(f"images: longest side {spec.default_side}, patches of {spec.patch_size}")
     console.say(f"lengths: {'metres' if spec.metric else 'up to scale'}")
+    console.say(f"takes: {TAKES[spec.takes]}")
     if spec.caution:
         console.say(spec.caution)
     if built.cross_view is None:

@@ -1,5 +1,7 @@
 """Cameras from a predicted ray map (DA3's ``use_ray_pose``; docs/models/da3.md, "Cameras from rays").
 
+`intrinsics_from_rays` is for rays in the camera's own frame (docs/models/mapanything.md, "Intrinsics").
+
 A ray map gives each cell a direction and an origin in the reference frame. Directions are a homography of the image
 plane, ``direction ~ R_world_cam K^-1 (x, y, 1)``; it is estimated robustly and split into rotation and intrinsics.
 
@@ -15,13 +17,14 @@ from freegeo.errors import FreeGeoError
 from freegeo.geometry.camera import K_from_focal
 from freegeo.geometry.se3 import from_Rt
 
-__all__ = ["cameras_from_rays"]
+__all__ = ["cameras_from_rays", "intrinsics_from_rays"]
 
 SMALLEST_Z = 1e-4  # directions flatter than this have no image-plane coordinates
 CANDIDATE_SHARE = 0.3  # hypotheses are drawn from the most confident rays
 HYPOTHESES = 100
 POINTS_PER_HYPOTHESIS = 8
 INLIER_ERROR = 0.2  # in image-plane units at depth 1
+FIT_SAMPLES = 50  # rays of a row and of a column from which on only every n-th enters a fit of intrinsics
 
 
 def cameras_from_rays(
@@ -70,6 +73,41 @@ def cameras_from_rays(
     found = (T_cam_world.reshape(*leading, 4, 4), K.reshape(*leading, 3, 3))
     T_cam_world, K = (values.to(origin.dtype).to(origin.device) for values in found)
     return T_cam_world, K
+
+
+def intrinsics_from_rays(rays: Tensor) -> Tensor:
+    """Intrinsics (..., 3, 3), in pixels of the map, of directions (..., H, W, 3) of any length in the camera's frame.
+
+    Least squares in each axis of ``u = cx + fx x / z``, over every 50th part of a row and of a column, in float64 where
+    the device has it. Directions flatter than 1e-4 are left out; nan where fewer than two differ.
+    """
+    height, width = rays.shape[-3:-1]
+    step_y, step_x = max(1, height // FIT_SAMPLES), max(1, width // FIT_SAMPLES)
+    sampled = rays[..., ::step_y, ::step_x, :].flatten(-3, -2)
+    # Around the means float32, which Apple GPUs are limited to, keeps what it has of the rays.
+    sampled = sampled if rays.device.type == "mps" else sampled.double()
+    v, u = torch.meshgrid(
+        torch.arange(0, height, step_y, dtype=sampled.dtype, device=rays.device),
+        torch.arange(0, width, step_x, dtype=sampled.dtype, device=rays.device),
+        indexing="ij",
+    )
+    usable = sampled[..., 2].abs() > SMALLEST_Z
+    z = torch.where(usable, sampled[..., 2], 1.0)
+    found = [
+        _fit_line(torch.where(usable, sampled[..., axis] / z, 0.0), pixel.flatten(), usable.to(z))
+        for axis, pixel in ((0, u), (1, v))
+    ]
+    (focal_x, centre_x), (focal_y, centre_y) = found
+    return K_from_focal(focal_x, focal_y, centre_x, centre_y).to(rays.dtype)
+
+
+def _fit_line(x: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Slope and value at 0 (...) of the line nearest to y over x (..., n), by weights."""
+    total = weight.sum(-1)
+    mean_x, mean_y = (x * weight).sum(-1) / total, (y * weight).sum(-1) / total
+    from_mean = (x - mean_x[..., None]) * weight
+    slope = (from_mean * (y - mean_y[..., None])).sum(-1) / (from_mean * (x - mean_x[..., None])).sum(-1)
+    return slope, mean_y - slope * mean_x
 
 
 def _normalised_grid(height: int, width: int, *, like: Tensor) -> Tensor:

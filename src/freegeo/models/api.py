@@ -58,7 +58,7 @@ class ReconstructionModel(nn.Module, ABC):
         """Mix the views; `layers` limits the result to some of the decoder's layers, nothing above them is computed.
 
         `priors` are what is known of the views, in any world frame and unit: the model normalises them. UserError for
-        priors that `spec.takes` excludes (`freegeo.models.priors.usable` leaves these out and says so).
+        priors that `spec.takes` excludes; a model that takes parts uses what `freegeo.models.priors.usable` leaves.
         """
 
     @abstractmethod

@@ -19,6 +19,7 @@ FAMILIES = (
     "freegeo.models.da3_config",
     "freegeo.models.vggt_config",
     "freegeo.models.pi3_config",
+    "freegeo.models.mapanything_config",
 )
 """Modules, free of torch, that list their models in `ENTRIES`; a new backbone of the package is named here."""
 DEFAULT_MODEL = "da3-base"

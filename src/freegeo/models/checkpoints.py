@@ -297,9 +297,15 @@ def _floats(state: Mapping[str, Tensor]) -> list[str]:
 def match_names(
     model: nn.Module, shapes: Mapping[str, tuple[int, ...]], path: Path, rules: KeyRules, model_name: str
 ) -> dict[str, str]:
-    """Return our name -> file name for every tensor of a model; UserError unless names and shapes match exactly."""
+    """Return our name -> file name for every tensor of a model; UserError unless names and shapes match exactly.
+
+    The file of another model that `rules` know of is refused by what it is.
+    """
     wanted = {name: tuple(value.shape) for name, value in model.state_dict().items()}
     source = _unwrapped(list(shapes), wanted, path)
+    for name, sentence in rules.foreign.items():
+        if name in source:
+            raise UserError(f"{path}: {sentence}")
     source = {name: file_name for name, file_name in source.items() if not name.startswith(rules.skipped or ("\0",))}
     for alias, stored in rules.aliases.items():
         if stored in source:

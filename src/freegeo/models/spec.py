@@ -88,6 +88,8 @@ class KeyRules:
     """Prefixes (after that) of parts that are not built."""
     aliases: Mapping[str, str] = field(default_factory=dict)
     """Names of a shared tensor that a file may leave out -> the name it is stored under."""
+    foreign: Mapping[str, str] = field(default_factory=dict)
+    """Names that only files of another model have -> a sentence on what that is."""
 
     def file_names(self, names: Iterable[str]) -> dict[str, str]:
         """Return our name -> file name for a file that leaves the aliases out."""
