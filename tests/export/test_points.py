@@ -5,14 +5,20 @@ import pytest
 import trimesh
 
 from exact_rooms import cloud_of, room
+from freegeo.data.procedural import sample_rooms
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.glb import FRUSTUM_SHARE, frustum_corners, opencv_to_gltf, order_colours, write_glb
 from freegeo.export.ply import write_ply
+from freegeo.fusion.normals import point_normals
 from freegeo.fusion.points import PointCloud
 
 
 def write_scene(scene, cloud, path):
     return write_glb(cloud, scene.T_cam_world, scene.K, scene.image_hw, path, lengths=scene.lengths)
+
+
+def normals_of(scene, cloud):
+    return point_normals(cloud, scene.depth_z, scene.T_cam_world, scene.K)
 
 
 def test_points_project_back_to_their_pixels_and_carry_their_colours():
@@ -62,12 +68,53 @@ def test_thinning_is_seeded_and_keeps_the_order():
         cloud_of(scene, drop_share=1.0)
 
 
-def test_ply_reopens_with_the_same_points_and_colours(tmp_path):
-    cloud = cloud_of(room())
-    loaded = trimesh.load(write_ply(cloud, tmp_path / "deep" / "points.ply", lengths="up to scale"))
+def test_ply_reopens_with_the_same_points_colours_and_normals(tmp_path):
+    scene = room()
+    cloud = cloud_of(scene)
+    normals = normals_of(scene, cloud)
+    normals[3] = 0
+    path = write_ply(cloud, tmp_path / "deep" / "points.ply", lengths="up to scale", normals=normals)
+    loaded = trimesh.load(path)
     np.testing.assert_array_equal(loaded.vertices.astype(np.float32), cloud.points)
     np.testing.assert_array_equal(loaded.colors[:, :3], cloud.colours)
+    raw = loaded.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(np.stack([raw[name] for name in ("nx", "ny", "nz")], axis=-1), normals)
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["points.ply"]
+    header = path.read_bytes().split(b"end_header")[0].decode()
+    assert "comment lengths are up to scale" in header and "0 0 0: not known" in header
+
+
+def test_normals_are_those_of_the_surfaces_and_point_into_the_room():
+    scene = room()
+    cloud = cloud_of(scene, drop_share=0.0)
+    normals = normals_of(scene, cloud)
+    in_room = sample_rooms([3], frames=4)
+    R, half = in_room.T_room_world[0, :3].numpy(), in_room.size[0, 0].numpy()
+    places, directions = cloud.points @ R[:, :3].T + R[:, 3], normals @ R[:, :3].T
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    # The walls, the floor and the ceiling; where they meet, neighbours are on both.
+    for axis in range(3):
+        for side in (-1, 1):
+            end = in_room.center[0, 0].numpy()[axis] + side * half[axis]
+            on_it = np.abs(places[:, axis] - end) < 0.002
+            if on_it.sum() > 100:
+                angle = np.degrees(np.arccos(np.clip(-side * directions[on_it, axis], -1, 1)))
+                assert np.quantile(angle, 0.9) < 1, (axis, side)
+
+
+def test_normals_do_not_reach_over_the_edge_of_a_surface_or_of_the_photo():
+    scene = room(1, (12, 16))
+    depth = np.full_like(scene.depth_z, 2.0)
+    depth[:, :, 8:] = 4.0
+    depth[:, 5, 3] = np.nan
+    flat = replace(scene, depth_z=depth, T_cam_world=np.eye(4, dtype=np.float32)[None])
+    cloud = cloud_of(flat, drop_share=0.0, drop_flying=False)
+    normals = normals_of(flat, cloud)
+    np.testing.assert_allclose(normals, np.tile((0, 0, -1), (len(cloud), 1)), atol=1e-4)
+    depth[:, :, 9:] = np.nan
+    alone = cloud.pixel[:, 0] == 8
+    unknown = normals_of(replace(flat, depth_z=depth), cloud.select(alone))
+    np.testing.assert_array_equal(unknown, 0)
 
 
 def test_gltf_axes():
@@ -136,7 +183,7 @@ def test_nothing_is_written_without_points(tmp_path):
     scene = room()
     empty = cloud_of(scene).select(np.zeros(0, np.int64))
     with pytest.raises(FreeGeoError, match="no point is left"):
-        write_ply(empty, tmp_path / "points.ply", lengths="up to scale")
+        write_ply(empty, tmp_path / "points.ply", lengths="up to scale", normals=np.zeros((0, 3)))
     with pytest.raises(FreeGeoError, match="no point is left"):
         write_scene(scene, empty, tmp_path / "scene.glb")
     assert list(tmp_path.iterdir()) == []

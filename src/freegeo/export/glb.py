@@ -1,7 +1,12 @@
-"""``scene.glb``: coloured points and one small frustum per camera, in glTF axes (y up, cameras look along -z)."""
+"""``scene.glb``: coloured points and one small frustum per camera, in glTF axes (y up, cameras look along -z).
+
+Its y axis is up in the room where that can be told (`freegeo.export.gravity`), which turns points and frusta together;
+otherwise it is the up of the reconstruction's world. No other file is turned. The scene's extras say which it is.
+"""
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,16 +14,22 @@ import numpy as np
 
 from freegeo import files
 from freegeo.export.base import Export, Format
+from freegeo.export.gravity import Up, find_up, upright_rotation
 from freegeo.export.ply import require_points
 
 if TYPE_CHECKING:
     from freegeo.fusion.points import PointCloud
 
+logger = logging.getLogger(__name__)
+
 FILE_NAME = "scene.glb"
+UP_UNKNOWN = "not known: the cameras disagree, so it is that of the reconstruction's world"
 FRUSTUM_SHARE = 0.08
 """Depth of a frustum as a share of the median distance of the points from the cameras that saw them."""
 BEAM_SHARE = 0.02
 """Width of a frustum's beams as a share of its depth."""
+_FOR_UP = 3000
+"""Points that are enough to find the floor."""
 # Corners: the camera's centre, then the image's; edges by corner numbers.
 _EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
 _BOX_FACES = (
@@ -30,7 +41,7 @@ _BOX_FACES = (
 def opencv_to_gltf(vectors: np.ndarray) -> np.ndarray:
     """Turn vectors (..., 3) from OpenCV axes (y down, z forward) to glTF axes (y up, z backward), half a turn about x.
 
-    It is its own inverse. No other function converts axes for the GLB file.
+    It is its own inverse.
     """
     return vectors * np.asarray((1, -1, -1), dtype=vectors.dtype)
 
@@ -43,10 +54,12 @@ def write_glb(
     path: Path,
     *,
     lengths: str,
+    up: Up | None = None,
 ) -> Path:
     """Write points and camera frusta.
 
-    The scene's objects are named `points` and `camera_000`, `camera_001`, ... in view order; its extras say the unit.
+    The scene's objects are named `points` and `camera_000`, `camera_001`, ... in view order; its extras say the unit
+    and what up rests on.
 
     Args:
         cloud: world points.
@@ -55,6 +68,7 @@ def write_glb(
         image_hw: height and width.
         path: of the file.
         lengths: that of the reconstruction.
+        up: becomes +y; None: the axes of the world are only renamed (`opencv_to_gltf`).
 
     Raises:
         FreeGeoError: there is no point.
@@ -62,15 +76,16 @@ def write_glb(
     import trimesh
 
     require_points(cloud, path)
-    scene = trimesh.Scene(metadata={"lengths": lengths})
-    points = trimesh.PointCloud(opencv_to_gltf(cloud.points), colors=cloud.colours)
+    turn = np.diag(opencv_to_gltf(np.ones(3))) if up is None else upright_rotation(up.direction, T_cam_world)
+    scene = trimesh.Scene(metadata={"lengths": lengths, "up": UP_UNKNOWN if up is None else up.source})
+    points = trimesh.PointCloud(cloud.points @ turn.T.astype(np.float32), colors=cloud.colours)
     scene.add_geometry(points, geom_name="points", node_name="points")
     size = FRUSTUM_SHARE * _typical_depth(cloud, T_cam_world)
     for view, colour in enumerate(order_colours(len(K))):
         corners = frustum_corners(T_cam_world[view], K[view], image_hw, size)
         vertices, faces = _beams(corners, BEAM_SHARE * size)
         colours = np.tile(colour, (len(vertices), 1))
-        mesh = trimesh.Trimesh(opencv_to_gltf(vertices), faces, vertex_colors=colours, process=False)
+        mesh = trimesh.Trimesh(vertices @ turn.T, faces, vertex_colors=colours, process=False)
         scene.add_geometry(mesh, geom_name=f"camera_{view:03d}", node_name=f"camera_{view:03d}")
     with files.atomic_path(path) as part:
         part.write_bytes(scene.export(file_type="glb"))
@@ -100,9 +115,13 @@ def order_colours(count: int) -> np.ndarray:
 
 
 def _typical_depth(cloud: PointCloud, T_cam_world: np.ndarray) -> float:
-    chosen = cloud.select(np.linspace(0, len(cloud) - 1, min(len(cloud), 10_000)).astype(np.int64))
+    chosen = _even_choice(cloud, 10_000)
     T = T_cam_world[chosen.view]
     return float(np.median(np.einsum("ni,ni->n", T[:, 2, :3], chosen.points) + T[:, 2, 3]))
+
+
+def _even_choice(cloud: PointCloud, most: int) -> PointCloud:
+    return cloud.select(np.linspace(0, len(cloud) - 1, min(len(cloud), most)).astype(np.int64))
 
 
 def _beams(corners: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
@@ -122,8 +141,15 @@ def _beams(corners: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _write(export: Export) -> list[Path]:
+    from freegeo.fusion.normals import point_normals
+
     r = export.reconstruction
-    return [write_glb(export.cloud, *r.cameras(), r.image_hw, export.folder / FILE_NAME, lengths=r.lengths)]
+    T_cam_world, K = r.cameras()
+    some = _even_choice(export.cloud, _FOR_UP)
+    up = find_up(T_cam_world, some.points, point_normals(some, r.depth_z, T_cam_world, K))
+    logger.info("%s: up is %s", FILE_NAME, UP_UNKNOWN if up is None else up.source)
+    path = export.folder / FILE_NAME
+    return [write_glb(export.cloud, T_cam_world, K, r.image_hw, path, lengths=r.lengths, up=up)]
 
 
-FORMAT = Format(name="glb", path=FILE_NAME, about="points and camera frusta", write=_write)
+FORMAT = Format(name="glb", path=FILE_NAME, about="points and camera frusta, y up where it can be told", write=_write)

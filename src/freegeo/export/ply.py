@@ -1,12 +1,16 @@
 """``points.ply``: coloured points in the reconstruction's world frame (OpenCV axes), binary little endian.
 
-A comment in the header says the unit, as in ``mesh.ply``.
+Comments in the header say the unit, as in ``mesh.ply``, and what the normals are: they point to the camera that saw the
+point, and are 0 0 0 where the pixels beside it show another surface or none.
 """
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from freegeo import files
 from freegeo.errors import FreeGeoError
@@ -17,20 +21,41 @@ if TYPE_CHECKING:
 
     from freegeo.fusion.points import PointCloud
 
+logger = logging.getLogger(__name__)
+
 FILE_NAME = "points.ply"
+NORMALS = "normals point to the camera that saw the point; 0 0 0: not known"
+_FLOATS, _COLOURS = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
 
 
-def write_ply(cloud: PointCloud, path: Path, *, lengths: str) -> Path:
-    """Write the points; FreeGeoError when there are none. `lengths` is that of the reconstruction."""
-    import trimesh
+def write_ply(cloud: PointCloud, path: Path, *, lengths: str, normals: np.ndarray) -> Path:
+    """Write the points.
 
+    Args:
+        cloud: world points.
+        path: of the file.
+        lengths: that of the reconstruction.
+        normals: (n, 3) of the points, 0 where they are not known.
+
+    Raises:
+        FreeGeoError: there is no point.
+    """
     require_points(cloud, path)
+    kinds = {**dict.fromkeys(_FLOATS, "<f4"), **dict.fromkeys(_COLOURS, "u1")}
+    rows = np.empty(len(cloud), list(kinds.items()))
+    for name, column in zip(kinds, (*cloud.points.T, *normals.T, *cloud.colours.T), strict=True):
+        rows[name] = column
+    header = [
+        "ply", "format binary_little_endian 1.0", f"comment lengths are {lengths}", f"comment {NORMALS}",
+        f"element vertex {len(rows)}", *(f"property float {name}" for name in _FLOATS),
+        *(f"property uchar {name}" for name in _COLOURS), "end_header", "",
+    ]  # fmt: skip
     with files.atomic_path(path) as part:
-        part.write_bytes(ply_bytes(trimesh.PointCloud(cloud.points, colors=cloud.colours), lengths))
+        part.write_bytes("\n".join(header).encode() + rows.tobytes())
     return path
 
 
-def ply_bytes(geometry: trimesh.PointCloud | trimesh.Trimesh, lengths: str) -> bytes:
+def ply_bytes(geometry: trimesh.Trimesh, lengths: str) -> bytes:
     """Return a PLY file whose header has a comment on the unit."""
     from trimesh.exchange.ply import export_ply
 
@@ -45,7 +70,14 @@ def require_points(cloud: PointCloud, path: Path) -> None:
 
 
 def _write(export: Export) -> list[Path]:
-    return [write_ply(export.cloud, export.folder / FILE_NAME, lengths=export.reconstruction.lengths)]
+    from freegeo.fusion.normals import point_normals
+
+    r = export.reconstruction
+    normals = point_normals(export.cloud, r.depth_z, *r.cameras())
+    unknown = np.count_nonzero(~normals.any(axis=1))
+    if unknown:
+        logger.info("%s: %.2g %% of the points have no normal (0 0 0)", FILE_NAME, 100 * unknown / len(normals))
+    return [write_ply(export.cloud, export.folder / FILE_NAME, lengths=r.lengths, normals=normals)]
 
 
-FORMAT = Format(name="ply", path=FILE_NAME, about="coloured points", write=_write)
+FORMAT = Format(name="ply", path=FILE_NAME, about="coloured points with normals", write=_write)

@@ -15,7 +15,7 @@ from freegeo.fusion.quantile import quantile
 from freegeo.fusion.settings import FilterSettings
 from freegeo.geometry.depth import valid_depth
 
-__all__ = ["FilterReport", "confident_pixels", "filter_pixels", "flying_pixels"]
+__all__ = ["FilterReport", "confident_pixels", "filter_pixels", "flying_pixels", "on_one_surface"]
 
 CONTINUATION_TOLERANCE = 0.03
 """Largest relative distance of a pixel from the straight continuation of its neighbours."""
@@ -186,11 +186,17 @@ def flying_pixels(depth_z: Tensor, K: Tensor) -> Tensor:
 
 def _continues(inverse: Tensor, focal: Tensor) -> Tensor:
     """Mask (S, H, W) of pixels that lie on the line of one of their two sides in the last dimension."""
-    before, after = _side(inverse, focal), _side(inverse.flip(-1), focal).flip(-1)
+    before, after = on_one_surface(inverse, focal), on_one_surface(inverse.flip(-1), focal).flip(-1)
     return before | after
 
 
-def _side(inverse: Tensor, focal: Tensor) -> Tensor:
+def on_one_surface(inverse: Tensor, focal: Tensor) -> Tensor:
+    """Mask (S, H, W) of the pixels that lie on one surface with the pixel before them in the last dimension.
+
+    Args:
+        inverse: (S, H, W) inverse depth, NaN where there is none.
+        focal: (S,) in pixels, along that dimension.
+    """
     near = torch.nn.functional.pad(inverse, (1, 0), value=torch.nan)[..., :-1]
     far = torch.nn.functional.pad(inverse, (2, 0), value=torch.nan)[..., :-2]
     steepest = STEEPEST_SLOPE / focal.to(inverse)[:, None, None]
