@@ -45,3 +45,10 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def short_flights(monkeypatch):
+    """Make fly-throughs of a few pictures, which are what takes time when all formats are written."""
+    monkeypatch.setattr("freegeo.export.flight.LEAST_FRAMES", 6)
+    monkeypatch.setattr("freegeo.export.flight.FRAMES_PER_VIEW", 2)

@@ -26,7 +26,7 @@ from freegeo.adaptation.samples import SceneImages
 from freegeo.adaptation.state import remove_state
 from freegeo.errors import DivergedError, NoEvidenceError
 from freegeo.evidence.guard import SHARES
-from freegeo.export.base import DEFAULT_FORMATS, TRACKS_NAME
+from freegeo.export.base import DEFAULT_FORMATS, TRACKS_NAME, Before
 from freegeo.export.formats import export, filter_reconstruction
 from freegeo.export.kept import save_kept
 from freegeo.export.measured import load_tracks, save_tracks
@@ -210,7 +210,7 @@ class Job:
         found = self.make()
         if self.photos is not None:
             doubt_focal_length(found.result, self.photos)
-        report, failed = self._export(found.result)
+        report, failed = self._export(found)
         summary = self._summary(found, report, failed, self.photos)
         write_json(self.folder / SUMMARY_NAME, summary)
         self.after(self)
@@ -437,13 +437,15 @@ class Job:
         if sentence not in self.warnings:
             self.warnings.append(sentence)
 
-    def _export(self, final: Reconstruction) -> tuple[FilterReport | None, Mapping[str, str]]:
+    def _export(self, found: Computed) -> tuple[FilterReport | None, Mapping[str, str]]:
         """Filter each reconstruction once and write all formats; returns as `write_files`."""
+        final = found.result
+        before = before_adaptation(self.folder.path, self._refinement()) if found.adaptation.used else None
         with self._timed(FILES_STAGE, FILTERS):
             masks = None if self.masks is None else masks_for_model(final, self.masks)
             return write_files(
                 self.folder.path, final, self.formats, filters=self.filters, masks=masks, photos=self.photos,
-                seed=self.seed,
+                before=before, seed=self.seed,
             )  # fmt: skip
 
     def _summary(
@@ -516,6 +518,17 @@ class Job:
         self.folder.note(part.name, {**noted, "seconds": seconds})
 
 
+def before_adaptation(folder: Path, refinement: Mapping[str, Any] | None) -> Before | None:
+    """Return the frozen model's prediction in the folder of an adapted result; None where there is none.
+
+    `refinement` is what reconstruction.json says of it.
+    """
+    if not (folder / FROZEN_FOLDER / PREDICTION_NAME).is_file():
+        return None
+    refined = bool((refinement or {}).get("accepted"))
+    return Before(folder=folder / FROZEN_FOLDER, result_label="refined" if refined else "adapted")
+
+
 def write_files(
     folder: Path,
     result: Reconstruction,
@@ -524,6 +537,7 @@ def write_files(
     filters: FilterSettings | None = None,
     masks: np.ndarray | None = None,
     photos: Sequence[PhotoLike] | None = None,
+    before: Before | None = None,
     seed: int = SEED,
 ) -> tuple[FilterReport | None, Mapping[str, str]]:
     """Choose the points of a result and of the predictions before it, and write the result's files.
@@ -535,6 +549,7 @@ def write_files(
         filters: which points are kept; None: the defaults.
         masks: (S, H, W) bool, pixels that the user wants; None: all.
         photos: the photos, of which some formats write copies.
+        before: the prediction before adaptation, which the fly-through shows beside the result.
         seed: of the random choice of points.
 
     Returns:
@@ -544,8 +559,8 @@ def write_files(
     if result.has_cameras:
         for name in (FROZEN_FOLDER, UNREFINED_FOLDER):
             if (folder / name / PREDICTION_NAME).is_file():
-                before = Reconstruction.load(folder / name)
-                save_kept(folder / name, filter_reconstruction(before, masks=masks, settings=filters), masks)
+                earlier = Reconstruction.load(folder / name)
+                save_kept(folder / name, filter_reconstruction(earlier, masks=masks, settings=filters), masks)
         filtered = filter_reconstruction(result, masks=masks, settings=filters)
         save_kept(folder, filtered, masks)
     exported = export(
@@ -556,6 +571,7 @@ def write_files(
         masks=masks,
         photos=photos,
         tracks=load_tracks(folder, len(result)),
+        before=before,
         seed=seed,
     )
     return None if filtered is None else filtered[1], exported.failed

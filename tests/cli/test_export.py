@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 import trimesh
@@ -12,6 +13,7 @@ from PIL import Image
 from cli.conftest import PHOTOS
 from cli.test_run import files
 from freegeo import files as writing
+from freegeo.export.formats import FORMATS
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import LEDGER_FILE, RUN_FILE
 from freegeo.fusion.settings import FilterSettings
@@ -108,7 +110,7 @@ def test_files_do_not_go_into_the_folder_of_another_result(freegeo, out, origina
 # -- which formats
 
 
-def test_commas_spaces_and_all(freegeo, out, tmp_path):
+def test_commas_spaces_and_all(freegeo, out, tmp_path, short_flights):
     for k, formats in enumerate((["-f", "ply,glb"], ["-f", "ply", "glb"], ["-f", "ply", "-f", "glb"], ["-f=ply,glb"])):
         assert freegeo("export", out, *formats, "-o", tmp_path / str(k)).code == 0
         assert files(tmp_path / str(k)) == {"points.ply", "scene.glb"}
@@ -120,7 +122,7 @@ def test_commas_spaces_and_all(freegeo, out, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["-f"], "Choose from npz, ply, glb, mesh, colmap, nerfstudio, tum, depth, or all"),
+        (["-f"], f"Choose from {', '.join(FORMATS)}, or all"),
         (["-f", ","], "Choose from npz"),
         (["-f", "ply,obj"], "Unknown export format 'obj'. Choose from npz, ply"),
         ([], "--format"),
@@ -141,7 +143,9 @@ def test_formats_of_a_run_without_a_value_are_refused(freegeo, photo_folder, tin
     assert "Choose from npz" in outcome.sentence()
 
 
-def test_colmap_of_one_photo_is_refused_before_anything_is_computed(freegeo, photo_folder, tiny, tmp_path, caplog):
+def test_colmap_of_one_photo_is_refused_before_anything_is_computed(
+    freegeo, photo_folder, tiny, tmp_path, caplog, short_flights
+):
     photo = photo_folder / "0.png"
     outcome = freegeo("reconstruct", photo, "-o", tmp_path / "out", *tiny, "--formats", "ply,colmap")
     assert outcome.code == 2
@@ -198,6 +202,24 @@ def test_files_beside_a_report_show_its_points(freegeo, out):
     assert outcome.code == 2
     assert "show other points than these options keep" in outcome.sentence() and "--output" in outcome.sentence()
     assert (out / "points.ply").read_bytes() == before
+
+
+@pytest.mark.slow
+def test_the_flight_through_an_adapted_result_shows_the_frozen_one_too(
+    freegeo, photo_folder, tiny, tmp_path, short_flights
+):
+    def width(file):
+        with av.open(str(file)) as video:
+            return video.streams.video[0].width
+
+    out, name = tmp_path / "out", "flythrough.mp4"
+    done = freegeo("run", photo_folder, "-o", out, *tiny, "--steps", 3, "--guard", "off", "--formats", "video")
+    assert done.code == 0, done.err
+    assert width(out / name) == 2 * 256
+    assert freegeo("export", out, "-f", "video", "-o", tmp_path / "again").code == 0
+    assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()
+    assert freegeo("export", out, "-f", "video", "--frozen").code == 0
+    assert width(out / "frozen" / name) == 256
 
 
 def test_a_model_without_cameras_writes_what_needs_none(freegeo, photo_folder, tiny, tmp_path, monkeypatch):

@@ -56,7 +56,7 @@ def export(
     from freegeo.export.pixels import masks_for_model
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.files import remove_parts
-    from freegeo.job import FROZEN_FOLDER
+    from freegeo.job import FROZEN_FOLDER, before_adaptation
     from freegeo.lock import kept_still, locked
 
     source = source.expanduser()
@@ -81,13 +81,17 @@ def export(
                 filtered = formats.filter_reconstruction(reconstruction, masks=masks, settings=filters.settings())
                 if target.resolve() == run:
                     require_points_of_report(target, filtered[0])
+        summary = stored_summary(run or home)
+        before = (
+            before_adaptation(home, summary["refinement"]) if home.resolve() == run and summary.get("adapter") else None
+        )
         place = result_folder(target) or target
         with nullcontext() if place == run else locked(place):
             remove_parts(place)
             result = formats.export(
                 reconstruction, target, names, filtered=filtered, masks=masks,
                 photos=find_photos(reconstruction, run or home), max_points=max_points, max_tracks=max_tracks,
-                voxel=voxel, tracks=load_tracks(home, len(reconstruction)),
+                voxel=voxel, tracks=load_tracks(home, len(reconstruction)), before=before,
             ).require_any()  # fmt: skip
     for file in result.files:
         console.say(f"  {file}  {console.size(file)}")

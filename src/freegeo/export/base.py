@@ -69,6 +69,18 @@ class Exported:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Before:
+    """An earlier prediction of the same views, for formats that show it beside the result."""
+
+    folder: Path
+    """Holds it, and which of its pixels became points."""
+    label: str = "frozen"
+    """What it is called, as in the report."""
+    result_label: str = "adapted"
+    """What the result is called."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Export:
     """One export: what is written, where, and how; the point cloud is computed once for all formats."""
 
@@ -89,6 +101,8 @@ class Export:
     """The photos of the reconstruction, in its order; None when they are not at hand."""
     tracks: Tracks | None
     """Points that were measured in the photos; None: there are none."""
+    before: Before | None
+    """None: there is no earlier prediction."""
     seed: int
     written: dict[str, list[Path]] = field(default_factory=dict)
     """Files by the name of the format."""

@@ -15,9 +15,9 @@ import numpy as np
 
 from freegeo import files
 from freegeo.errors import FreeGeoError, LostFolderError, UserError
-from freegeo.export import colmap, depth_png, glb, mesh, nerfstudio, ply, tum
+from freegeo.export import colmap, depth_png, glb, mesh, nerfstudio, ply, rerun, tum, video
 from freegeo.export import reconstruction as npz
-from freegeo.export.base import MAX_TRACKS, Export, Exported, Format
+from freegeo.export.base import MAX_TRACKS, Before, Export, Exported, Format
 from freegeo.fusion.settings import MAX_POINTS, FilterSettings
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_MODULES = (npz, ply, glb, mesh, colmap, nerfstudio, tum, depth_png)
+_MODULES = (npz, ply, glb, mesh, colmap, nerfstudio, tum, depth_png, video, rerun)
 FORMATS: dict[str, Format] = {module.FORMAT.name: module.FORMAT for module in _MODULES}
 ALL = "all"
 """Name that selects every format."""
@@ -99,6 +99,7 @@ def export(
     max_tracks: int | None = MAX_TRACKS,
     voxel: float | None = None,
     tracks: Tracks | None = None,
+    before: Before | None = None,
     seed: int = 0,
 ) -> Exported:
     """Write a reconstruction in several formats; one that has nothing to write is a warning and costs no other.
@@ -117,6 +118,7 @@ def export(
         max_tracks: points of the COLMAP model; None writes all.
         voxel: voxel edge of the mesh in the reconstruction's units; default chosen from its resolution.
         tracks: points that were measured in the photos, for the COLMAP model; None: it gets projected ones.
+        before: an earlier prediction of the same views, which the fly-through shows beside this one.
         seed: of the random choice of points.
 
     Raises:
@@ -146,6 +148,7 @@ def export(
         voxel=voxel,
         photos=photos,
         tracks=tracks,
+        before=before,
         seed=seed,
     )
     written: list[Path] = []

@@ -18,12 +18,13 @@ import numpy as np
 import torch
 
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.export.alignment import align, median_ratio, moved_cameras, similarity, valid_pixels
 from freegeo.export.formats import filter_reconstruction
 from freegeo.export.kept import Filtered, load_kept
 from freegeo.export.reconstruction import FILE_NAME, Reconstruction
 from freegeo.files import FORMAT
-from freegeo.geometry.depth import depth_to_world, valid_depth
-from freegeo.geometry.rotation import mean_rotation, rotation_angle
+from freegeo.geometry.depth import depth_to_world
+from freegeo.geometry.rotation import rotation_angle
 from freegeo.geometry.se3 import camera_centres
 from freegeo.geometry.sim3 import Sim3
 from freegeo.report.schema import AdapterNotes, DemoScores, Summary, read_part
@@ -241,7 +242,7 @@ def moved(result: Result, onto: Stage) -> Result:
         raise UserError(f"{result.folder}: shows other photos or another resolution; only one scene can be compared.")
     if result.final.T_cam_world is None or onto.T_cam_world is None:
         return result
-    return moved_by(result, _similarity(result.final.depth_z, result.final.T_cam_world, onto.depth_z, onto.T_cam_world))
+    return moved_by(result, similarity(result.final.depth_z, result.final.T_cam_world, onto.depth_z, onto.T_cam_world))
 
 
 def moved_by(result: Result, move: Sim3) -> Result:
@@ -252,38 +253,11 @@ def moved_by(result: Result, move: Sim3) -> Result:
         scale = float(move.s)
         stages[key] = replace(
             stage, depth_z=(stage.depth_z * scale).astype(np.float32), scale=stage.scale * scale,
-            T_cam_world=_moved_cameras(stage.T_cam_world, move),
+            T_cam_world=moved_cameras(stage.T_cam_world, move),
         )  # fmt: skip
     own = result.from_own_frame
     both = None if own is None else Sim3(s=move.s * own.s, R=move.R @ own.R, t=move.apply(own.t))
     return replace(result, stages=stages, from_own_frame=both)
-
-
-def align(estimate: Reconstruction, reference: Reconstruction) -> Sim3:
-    """Similarity from an estimate's world frame to a reference's, both of the same views and size.
-
-    The scale is the median ratio of depths, the rotation the mean over the cameras, the translation the median over
-    their centres. Unlike a fit to the centres alone it also works for cameras on a line or in one place.
-    """
-    return _similarity(estimate.depth_z, estimate.cameras()[0], reference.depth_z, reference.cameras()[0])
-
-
-def _similarity(depth: np.ndarray, T: np.ndarray, depth_reference: np.ndarray, T_reference: np.ndarray) -> Sim3:
-    scale = median_ratio(depth_reference, depth)
-    cameras, goal = torch.from_numpy(T).double(), torch.from_numpy(T_reference).double()
-    R = mean_rotation(goal[:, :3, :3].mT @ cameras[:, :3, :3])
-    t = (camera_centres(goal) - scale * camera_centres(cameras) @ R.mT).median(0).values
-    return Sim3(s=torch.tensor(scale, dtype=torch.float64), R=R, t=t)
-
-
-def median_ratio(reference: np.ndarray, estimate: np.ndarray) -> float:
-    """Median of reference / estimate over pixels valid in both; 1 when there is none."""
-    valid = _valid(reference) & _valid(estimate)
-    return float(np.median(reference[valid] / estimate[valid])) if valid.any() else 1.0
-
-
-def _valid(depth_z: np.ndarray) -> np.ndarray:
-    return valid_depth(torch.from_numpy(depth_z)).numpy()
 
 
 def _stage(
@@ -293,12 +267,12 @@ def _stage(
     truth: Reconstruction | None,
     kept: Filtered | None,
 ) -> Stage:
-    keep, removed = _valid(value.depth_z) & value.inside(), {}
+    keep, removed = valid_pixels(value.depth_z) & value.inside(), {}
     if kept is not None:
         keep, removed = kept[0], dict(kept[1].removed)
     move = align(value, reference) if value.has_cameras and reference.has_cameras else None
     scale = median_ratio(reference.depth_z, value.depth_z) if move is None else float(move.s)
-    T_cam_world = value.T_cam_world if move is None else _moved_cameras(value.cameras()[0], move)
+    T_cam_world = value.T_cam_world if move is None else moved_cameras(value.cameras()[0], move)
     depth_z = (value.depth_z * scale).astype(np.float32)
     error = None if truth is None else relative_error(depth_z, truth.depth_z)
     return Stage(
@@ -319,7 +293,7 @@ def _kept(value: Reconstruction, shape: tuple[int, ...], folder: Path, step: int
 def _truth_stage(truth: Reconstruction) -> Stage:
     return Stage(
         key="truth", depth_z=truth.depth_z, conf=np.ones_like(truth.depth_z),
-        T_cam_world=_single(truth.T_cam_world), K=_single(truth.K), keep=_valid(truth.depth_z), removed={},
+        T_cam_world=_single(truth.T_cam_world), K=_single(truth.K), keep=valid_pixels(truth.depth_z), removed={},
         error=np.zeros_like(truth.depth_z),
     )  # fmt: skip
 
@@ -328,13 +302,9 @@ def _single(values: np.ndarray | None) -> np.ndarray | None:
     return None if values is None else values.astype(np.float32)
 
 
-def _moved_cameras(T_cam_world: np.ndarray, move: Sim3) -> np.ndarray:
-    return move.apply_to_cameras(torch.from_numpy(T_cam_world).double()).float().numpy()
-
-
 def relative_error(depth_z: np.ndarray, true_z: np.ndarray) -> np.ndarray:
     """|d - d_true| / d_true (S, H, W) float32, NaN where one of the two is not valid."""
-    valid = _valid(depth_z) & _valid(true_z)
+    valid = valid_pixels(depth_z) & valid_pixels(true_z)
     error = np.full(depth_z.shape, np.nan, dtype=np.float32)
     error[valid] = np.abs(depth_z[valid] - true_z[valid]) / true_z[valid]
     return error
