@@ -105,9 +105,20 @@ def test_pictures_of_many_views_show_those_nearby_only():
     scene = some(room(4), [0, 1, 2, 3] * 8)
     scene.T_cam_world[16:, :3, 3] += 100
     painter = Painter(scene, everything(scene), 2.0, (48, 64), 1.0)
-    painter.draw(scene.T_cam_world[0].astype(np.float64), np.array((50.0, 50.0)))
-    assert 0 < len(painter._views) <= WINDOW
+    picture = painter.draw(scene.T_cam_world[0].astype(np.float64), np.array((50.0, 50.0)))
+    assert len(painter._views) == WINDOW
     assert max(painter._views) < 16
+    assert (picture == BACKGROUND).all(axis=-1).mean() < 0.1
+
+
+def test_a_camera_that_stands_still_shows_a_few_views_in_whole():
+    scene = some(room(1), [0] * 40)
+    flight = plan_flight(scene, everything(scene))
+    painter = Painter(scene, everything(scene), flight.depth, (48, 64), 1.0)
+    picture = painter.draw(flight.T_cam_world[0], flight.focal[0])
+    assert len(painter._views) == WINDOW
+    assert (picture == BACKGROUND).all(axis=-1).mean() < 0.1
+    assert np.ptp(centres(flight.T_cam_world), axis=0).max() > 0.05 * flight.depth, "the flight moves"
 
 
 def test_the_file_is_what_browsers_play_and_the_same_each_time(tmp_path, short_flights):

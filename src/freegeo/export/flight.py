@@ -18,7 +18,7 @@ SMOOTHING = 0.6
 DETOUR = 1.3
 """Photos are passed in their own order if that is at most so much longer than from each to the nearest one left."""
 SWAY = 0.06
-"""Radius of the circle of a flight around a single camera, as a share of the depth."""
+"""Radius of the circle of a flight around one camera, as a share of the depth, where there is no longer way."""
 WINDOW = 12
 """Views whose points a picture shows, those nearest to its camera."""
 MOST_POINTS = 600_000
@@ -49,7 +49,7 @@ class Flight:
 
 
 def plan_flight(reconstruction: Reconstruction, keep: np.ndarray) -> Flight:
-    """Return a flight from view to view, at constant speed and smoothed; a circle around a single camera.
+    """Return a flight from view to view, at constant speed and smoothed; a circle around cameras in one place.
 
     Photos are passed in their order where that is a way (a walk, a video), otherwise from each to the nearest one left.
 
@@ -64,14 +64,15 @@ def plan_flight(reconstruction: Reconstruction, keep: np.ndarray) -> Flight:
     views = range(len(reconstruction))
     depth = float(median(lambda: (reconstruction.depth_z[view][keep[view]] for view in views)))
     focal = K[:, (0, 1), (0, 1)]
-    if len(reconstruction) == 1:
-        return Flight(T_cam_world=_circle(T_cam_world[0], depth), focal=focal.repeat(LEAST_FRAMES, 0), depth=depth)
     stops = np.unique(np.linspace(0, len(reconstruction) - 1, min(len(reconstruction), MOST_STOPS)).astype(np.int64))
     distance = _distances(T_cam_world[stops], T_cam_world[stops], depth)
     order = _order(distance)
     legs, stops = distance[order[:-1], order[1:]], stops[order]
+    if legs.sum() < SWAY:
+        circle = _circle(T_cam_world[stops[0]], depth)
+        return Flight(T_cam_world=circle, focal=focal[stops[:1]].repeat(len(circle), axis=0), depth=depth)
     poses = np.linalg.inv(T_cam_world[stops])
-    # A way of no length would have no speed.
+    # Two cameras in one place would leave the order open.
     along = np.concatenate(([0.0], np.cumsum(legs + 1e-6)))
     count = int(np.clip(FRAMES_PER_VIEW * (len(stops) - 1), LEAST_FRAMES, MOST_FRAMES))
     place = np.linspace(0, along[-1], count)
@@ -217,14 +218,16 @@ class Painter:
     def _near(self, T_cam_world: np.ndarray) -> list[tuple[_Points, int]]:
         """Return the points of the nearest views, and how many of each are drawn: fewer of those farther away."""
         cameras = self._reconstruction.cameras()[0].astype(np.float64)
-        share = np.ones(len(cameras))
+        chosen, share = np.arange(len(cameras)), np.ones(len(cameras))
         if len(cameras) > WINDOW:
             distance = _distances(T_cam_world[None], cameras, self._depth)[0]
-            farthest = np.partition(distance, WINDOW)[WINDOW]
-            share = np.clip(2 * (1 - distance / max(farthest, 1e-9)), 0, 1)
-        chosen = np.flatnonzero(share).tolist()
-        self._views = {view: self._views.get(view) or self._points(view) for view in chosen}
-        return [(self._views[view], round(share[view] * len(self._views[view].rgb))) for view in chosen]
+            nearest = np.argsort(distance, kind="stable")[: WINDOW + 1]
+            chosen, closer = np.sort(nearest[:-1]), distance[nearest[-1]] - distance
+            # Half as close as the closest one is close enough; the first that is left out has 0.
+            if closer.max() > 0:
+                share = np.clip(2 * closer / closer.max(), 0, 1)
+        self._views = {view: self._views.get(view) or self._points(view) for view in chosen.tolist()}
+        return [(part, round(share[view] * len(part.rgb))) for view, part in self._views.items()]
 
     def _points(self, view: int) -> _Points:
         r, step = self._reconstruction, self._stride
