@@ -3,6 +3,7 @@
 import ipaddress
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 EVENTS = ("socket.getaddrinfo", "socket.gethostbyname", "socket.connect", "socket.sendto")
 asked: list[str] = []
@@ -35,3 +36,24 @@ def watch(refuse: Callable[[str], None]) -> None:
                 refuse(asked[-1])
 
     sys.addaudithook(hook)
+
+
+def watch_processes(folder: Path) -> Path:
+    """Make Python processes that have `folder` in PYTHONPATH note what they ask for in a file, which is returned."""
+    log = folder / "asked.txt"
+    log.touch()
+    (folder / "sitecustomize.py").write_text(
+        f"""
+import sys
+sys.path.append({str(Path(__file__).parent)!r})
+import offline
+
+def refuse(text):
+    with open({str(log)!r}, "a") as file:
+        file.write(text + "\\n")
+    raise ConnectionRefusedError(text)
+
+offline.watch(refuse)
+"""
+    )
+    return log

@@ -29,6 +29,7 @@ ALLOWED = {
     "progress": {"adaptation"},
     "benchmark": {"adaptation", "models", "data", "fusion", "metrics", "geometry", "pools"},
     "sequence": {"evidence", "models", "fusion", "geometry"},
+    "webapp": {"adaptation", "data", "export", "models", "progress", "report"},
     "training": {"models", "data", "metrics", "geometry"},
     "adaptation": {"models", "data.scene", "geometry"},
     "evidence": {"export", "fusion", "metrics", "geometry"},
@@ -51,7 +52,7 @@ ALLOWED = {
 }
 HEAVY = {
     "peft", "scipy", "cv2", "trimesh", "matplotlib", "huggingface_hub", "mcubes", "av", "pycolmap", "viser",
-    "transformers", "jinja2", "ray", "open3d", "pillow_heif", "rerun",
+    "transformers", "jinja2", "ray", "open3d", "pillow_heif", "rerun", "gradio", "fastapi", "starlette", "uvicorn",
 }  # fmt: skip
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -19,6 +19,7 @@ HEAVY = (
     "huggingface_hub",
     "av",
     "viser",
+    "gradio",
 )
 HELP_BUDGET_S = 0.6
 """Twice what help may take on an idle machine, since this one may be busy; the measured time is in benchmarks/."""
@@ -57,6 +58,7 @@ def call(*arguments: str) -> str:
         pytest.param(call("run", "--help"), id="freegeo run --help"),
         pytest.param(call("demo", "--help"), id="freegeo demo --help"),
         pytest.param(call("models", "--help"), id="freegeo models --help"),
+        pytest.param(call("app", "--help"), id="freegeo app --help"),
     ],
 )
 def test_nothing_heavy_is_loaded(code):

@@ -67,6 +67,7 @@ LIGHT = [
     ["reconstruct", "rooms/room-0", "-o", "frozen", *TINY],
     ["export", "frozen", "-o", "files", "--format", "glb"],
     ["view", "frozen", "--port", "0"],
+    ["app", "--port", "0"],
 ]
 HEAVY = [
     ["models"],
@@ -80,22 +81,7 @@ HEAVY = [
 
 def watched(folder: Path, *arguments: str) -> tuple[str, str]:
     """Run Python in a folder and return what it printed, and what it and its processes asked the network for."""
-    log = folder / "asked.txt"
-    log.touch()
-    (folder / "sitecustomize.py").write_text(
-        f"""
-import sys
-sys.path.append({str(TESTS)!r})
-import offline
-
-def refuse(text):
-    with open({str(log)!r}, "a") as file:
-        file.write(text + "\\n")
-    raise ConnectionRefusedError(text)
-
-offline.watch(refuse)
-"""
-    )
+    log = offline.watch_processes(folder)
     # A home and a cache without anything in them, and nothing that forbids a download.
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("HF_", "RAY_"))}
     paths = [str(folder), str(TESTS.parent / "src")]

@@ -5,10 +5,13 @@ Everything goes to stderr. The library shows nothing unless it is asked to (`fre
 
 from __future__ import annotations
 
+import os
+import re
 import sys
 import time
 from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
@@ -20,6 +23,9 @@ if TYPE_CHECKING:
 Update = Callable[..., None]
 LINES = 10
 """Lines of a whole piece of work in a log file."""
+LINES_VARIABLE = "FREEGEO_PROGRESS_LINES"
+"""Environment variable with another number of lines, for a program that follows them (`read_line`)."""
+_LINE = re.compile(r"(?P<title>[^:/]+): (?P<done>\d+)/(?P<total>\d+)(, (?P<left>\d+) s left)?(, (?P<text>.+))?")
 LOSS_EVERY = 10
 """Most steps between two readings of the loss, each of which waits for the device."""
 
@@ -99,20 +105,45 @@ def in_notebook() -> bool:
     return Console().is_jupyter
 
 
+@dataclass(frozen=True)
+class Line:
+    """What a line in a log file says."""
+
+    title: str
+    done: int
+    total: int
+    seconds_left: int | None = None
+    text: str = ""
+
+    def __str__(self) -> str:
+        left = "" if self.seconds_left is None else f", {self.seconds_left} s left"
+        return f"{self.title}: {self.done}/{self.total}{left}{', ' + self.text if self.text else ''}"
+
+
+def read_line(text: str) -> Line | None:
+    """Return what a line of progress says; None for any other line."""
+    found = _LINE.fullmatch(text.rstrip())
+    if found is None:
+        return None
+    left = None if found["left"] is None else int(found["left"])
+    return Line(found["title"], int(found["done"]), int(found["total"]), left, found["text"] or "")
+
+
 def _lines(title: str, total: int) -> Update:
     first, shown, known = None, -1, ""
+    lines = int(os.environ.get(LINES_VARIABLE, LINES))
 
     def update(done: int, text: str | None = None) -> None:
         nonlocal first, shown, known
         known = known if text is None else text
         # Time and work before the first report, such as an adaptation or an earlier run, do not count for the speed.
         first = first or (done, time.monotonic())
-        tenth = done * LINES // total
-        if tenth > shown:
-            shown = tenth
+        part = done * lines // total
+        if part > shown:
+            shown = part
             gained, seconds = done - first[0], time.monotonic() - first[1]
-            left = f", {seconds * (total - done) / gained:.0f} s left" if gained else ""
-            sys.stderr.write(f"{title}: {done}/{total}{left}{', ' + known if known else ''}\n")
+            left = round(seconds * (total - done) / gained) if gained else None
+            sys.stderr.write(f"{Line(title, done, total, left, known)}\n")
             sys.stderr.flush()
 
     return update

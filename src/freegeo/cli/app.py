@@ -50,6 +50,7 @@ COMMANDS = {
     "cameras": ("freegeo.cli.cameras:app", "Check known cameras against photos, and convert them."),
     "refine": ("freegeo.cli.refine:refine", "Bring a result's cameras to its photos by bundle adjustment."),
     "export": ("freegeo.cli.export:export", "Write a reconstruction in other tools' formats."),
+    "app": ("freegeo.cli.webapp:webapp", "Photos in, adapted reconstruction out, in the browser."),
     "view": ("freegeo.cli.view:view", "Look at results in the browser, before and after adaptation."),
     "bench": ("freegeo.cli.bench:app", "Published evaluation: datasets, tables, comparison with the paper."),
     "models": ("freegeo.cli.models:app", "List, describe, download and check models."),

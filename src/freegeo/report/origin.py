@@ -15,10 +15,11 @@ from contextlib import contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
-from freegeo.errors import FreeGeoError
+from freegeo.errors import FreeGeoError, UserError
 
 logger = logging.getLogger(__name__)
 
+LOCAL_HOSTS = frozenset({"127.0.0.1", "localhost", "::1"})
 REFUSAL = "This viewer answers its own page only. Open the address that freegeo printed, or the machine's IP address.\n"
 _MOST_TOLD = 10
 """Most foreign pages that the log names."""
@@ -41,13 +42,20 @@ def is_own_page(origins: Sequence[str], hosts: Sequence[str], listening: str) ->
         return False
     try:
         page = urlsplit(origins[0])
-        name = page.hostname
     except ValueError:
         return False
-    if page.scheme not in ("http", "https") or page.netloc.lower() != hosts[0].lower() or not name:
+    same = page.scheme in ("http", "https") and page.netloc.lower() == hosts[0].lower()
+    return same and is_own_host(hosts[0], listening)
+
+
+def is_own_host(host: str, listening: str) -> bool:
+    """Whether the name in a header `Host` is localhost, an IP address, `listening`, or this machine's own name."""
+    try:
+        name = urlsplit(f"//{host}").hostname
+    except ValueError:
         return False
     own = socket.gethostname().lower()
-    return name in {"localhost", listening.lower(), own, f"{own.partition('.')[0]}.local"} or _is_address(name)
+    return name in {"localhost", listening.lower(), own, f"{own.partition('.')[0]}.local"} or _is_address(name or "")
 
 
 def _is_address(name: str) -> bool:
@@ -56,6 +64,25 @@ def _is_address(name: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def require_free_port(host: str, port: int) -> None:
+    """Raise UserError when the port cannot be opened; servers of others would take another one."""
+    if not 1 <= port <= 65535:
+        raise UserError(f"--port must be from 1 to 65535, got {port}.")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except socket.gaierror:
+        raise UserError(
+            f"--host {host}: no such address of this machine. Leave it out to listen on localhost."
+        ) from None
+    except OSError as error:
+        raise UserError(
+            f"port {port} on {host} cannot be used ({error.strerror}). Choose another with --port."
+        ) from None
 
 
 @contextmanager

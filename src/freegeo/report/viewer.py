@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import logging
-import socket
 from collections.abc import Iterator, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
@@ -27,13 +26,12 @@ from freegeo.geometry.sim3 import Sim3
 from freegeo.report import sequence
 from freegeo.report.answer import answer
 from freegeo.report.figures import CONF_MAP, DEPTH_MAP, ERROR_MAP, linear_colours, log_colours, log_range
-from freegeo.report.origin import own_pages_only
+from freegeo.report.origin import own_pages_only, require_free_port
 from freegeo.report.result import Result, Stage, even_choice, load_result, moved, moved_by
 from freegeo.report.scene3d import ERROR_LIMIT, MOST_CAMERAS, frustum_depth, level_rotation
 
 logger = logging.getLogger(__name__)
 
-LOCAL_HOSTS = frozenset({"127.0.0.1", "localhost", "::1"})
 BANDS = 20
 MAX_POINTS = 600_000
 """Most points of one stage that are sent to the browser; of more, a seeded choice."""
@@ -288,25 +286,6 @@ def _extent(stage: Stage) -> tuple[np.ndarray, np.ndarray, float]:
     seen = points[stage.keep] if stage.keep.any() else points.reshape(-1, 3)
     centre = np.quantile(seen @ level.T, (0.03, 0.97), axis=0).mean(axis=0) @ level
     return level, centre, float(np.quantile(np.linalg.norm(seen - centre, axis=1), 0.9)) or 1.0
-
-
-def require_free_port(host: str, port: int) -> None:
-    """Raise UserError when the port cannot be opened; viser itself would silently take another one."""
-    if not 1 <= port <= 65535:
-        raise UserError(f"--port must be from 1 to 65535, got {port}.")
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except socket.gaierror:
-        raise UserError(
-            f"--host {host}: no such address of this machine. Leave it out to listen on localhost."
-        ) from None
-    except OSError as error:
-        raise UserError(
-            f"port {port} on {host} cannot be used ({error.strerror}). Choose another with --port."
-        ) from None
 
 
 def answer_text(result: Result) -> str | None:

@@ -1,0 +1,1 @@
+"""The web app: photos in, an adapted reconstruction out, in a browser."""
