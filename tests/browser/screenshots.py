@@ -5,16 +5,17 @@ import sys
 from pathlib import Path
 
 from PIL import Image
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 
 from conftest import ARGUMENTS, CHROMIUM
 from freegeo.data.photos import load_photos
 from freegeo.report.page import write_report
 from freegeo.report.viewer import open_viewer
+from freegeo.webapp.server import serving
 
 FIGURES = Path(__file__).parents[2] / "docs" / "figures"
-PORT = 8437
-VIEWER_START_MS, SETTLE_MS = 15_000, 1_500
+PORT, APP_PORT = 8437, 8438
+VIEWER_START_MS, SETTLE_MS, RUN_MS = 15_000, 1_500, 300_000
 
 
 def save(page: Page, name: str) -> None:
@@ -45,8 +46,25 @@ def main(folder: Path) -> None:
             notice.first.click()
         page.wait_for_timeout(SETTLE_MS)
         save(page, "viewer.png")
+        save_app(browser, sorted((folder / "photos").iterdir()))
         browser.close()
     viewer.close()
+
+
+def save_app(browser: Browser, photos: list[Path]) -> None:
+    """Let the web app reconstruct the photos with the embedded model, and store what it shows then."""
+    page = browser.new_page(viewport={"width": 1280, "height": 1150})
+    with serving(host="127.0.0.1", port=APP_PORT, model="freegeo-tiny"):
+        page.goto(f"http://127.0.0.1:{APP_PORT}")
+        page.set_input_files("#photos input[type=file]", photos)
+        page.wait_for_selector(".fg-strip")
+        page.click("#start")
+        page.wait_for_selector(".fg-result", timeout=RUN_MS)
+        page.frame_locator("#scene3d").locator("#canvas3d").wait_for()
+        page.evaluate("scrollTo(0, 0)")
+        page.wait_for_timeout(SETTLE_MS)
+        save(page, "app.png")
+        page.close()
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from freegeo.lock import LOCK_FILE
 from freegeo.models import catalog
 from freegeo.report.result import SUMMARY_NAME
 from freegeo.webapp import page, server
-from freegeo.webapp.runs import RESULT, Run
+from freegeo.webapp.runs import PHOTOS, RESULT, Run
 from freegeo.webapp.sessions import Session
 
 
@@ -45,12 +45,22 @@ def finished(tmp_path):
     """A run whose result has the files that the page looks at."""
     result = tmp_path / RESULT
     (result / "frozen").mkdir(parents=True)
+    (tmp_path / PHOTOS).mkdir()
+    for number in range(3):
+        (tmp_path / PHOTOS / f"{number}.jpg").touch()
     for name in ("report.html", "prediction.npz", "frozen/prediction.npz", ".freegeo-run.json", LOCK_FILE):
         (result / name).write_text(name)
     verdict = {"outcome": "adapted", "reason": "The matches fit better."}
     recipe = {"name": "scene", "steps": 100, "lr": 3e-5, "hold": 1.0}
     warning = f"{tmp_path}/photos/a.jpg: almost black."
-    summary = {"format": 1, "recipe": recipe, "verdict": verdict, "filters": {}, "warnings": [warning]}
+    summary = {
+        "format": 1,
+        "recipe": recipe,
+        "verdict": verdict,
+        "filters": {},
+        "warnings": [warning],
+        "images": ["1.jpg"],
+    }
     (result / SUMMARY_NAME).write_text(json.dumps(summary))
     (result / "link").symlink_to("/etc/passwd")
     run = Run(folder=tmp_path, inputs=(), command=[])
@@ -70,11 +80,14 @@ def test_the_zip_file_holds_the_result_and_nothing_else(finished):
 
 
 def test_the_verdict_comes_first(finished):
-    text = page.result(finished)
+    text = page.result(finished, kept=False)
     assert "<b>Adaptation: yes.</b> The matches fit better." in text
     parts = ("Did it help?", ">a.jpg: almost black.", "/part/scene", "/part/photos", ".zip")
     assert sorted(parts, key=text.index) == list(parts)
     assert f"result/{finished.token}/files/prediction.npz" in text
+    assert "<dd>1 of 3</dd>" in text
+    assert "30 min after this page is closed" in text
+    assert f"stay in {finished.folder}" in page.result(finished, kept=True)
 
 
 def test_a_part_of_the_report_is_the_whole_page_with_the_rest_hidden():
@@ -110,3 +123,12 @@ def test_an_unknown_model_or_a_missing_extra_is_refused_before_anything_starts(m
     monkeypatch.setattr(server, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"freegeo\[app\]"), server.serving(host="127.0.0.1", port=7860):
         pass
+
+
+def test_a_page_whose_run_was_removed_says_so(tmp_path):
+    assert "away for too long" in page.panel(None, Session(), gone=True)
+    assert "away for too long" not in page.panel(None, Session())
+
+
+def test_sentences_begin_with_a_capital_and_names_of_files_stay_as_they_are():
+    assert [page.capital(text) for text in ("no photos", "a.jpg: damaged", "")] == ["No photos", "a.jpg: damaged", ""]

@@ -29,7 +29,7 @@ def webapp(
     port
         Port to listen on.
     keep
-        Folder in which photos and results stay; default: they are removed when the page is closed, and at the end.
+        Folder in which photos and results stay; default: they are removed after the page was closed, and at the end.
     model
         Model that is chosen at first; default: da3-base.
     device

@@ -19,8 +19,8 @@ from freegeo.models.spec import ModelEntry
 from freegeo.report.answer import answer
 from freegeo.report.result import REPORT_NAME, SUMMARY_NAME
 from freegeo.report.schema import Summary, read_part
-from freegeo.webapp.runs import Choice, Run
-from freegeo.webapp.sessions import Session, Sessions
+from freegeo.webapp.runs import PHOTOS, Choice, Run
+from freegeo.webapp.sessions import AWAY_S, Session, Sessions
 
 if TYPE_CHECKING:
     import gradio as gr
@@ -116,24 +116,32 @@ def _thumbnail(pixels: Any) -> str:
     return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 
-def panel(sessions: Sessions, session: Session) -> str:
-    """Return what stands beside the controls, as HTML: how to begin, how far it is, or the result."""
+def panel(sessions: Sessions, session: Session, *, gone: bool = False) -> str:
+    """Return what stands beside the controls, as HTML: how to begin, how far it is, or the result.
+
+    `gone`: the page had a run, which was removed since.
+    """
     run = session.run
     if run is None:
-        return render("begin.html.j2")
+        return render("begin.html.j2", gone=gone, away=duration(AWAY_S))
     if run.state == "done":
-        return result(run)
+        return result(run, kept=sessions.keep is not None)
     return render(
         "progress.html.j2", run=run, before=sessions.queue.before(run), duration=duration,
         sentence=capital(run.sentence or ""),
     )  # fmt: skip
 
 
-def result(run: Run) -> str:
-    """Return a finished result as HTML: the verdict, doubts, the scene, the maps, and the files."""
+def result(run: Run, *, kept: bool) -> str:
+    """Return a finished result as HTML: the verdict, doubts, the scene, the maps, and the files.
+
+    `kept`: it stays when the page is closed.
+    """
     summary = read_part(run.result / SUMMARY_NAME, Summary)
     seconds = sum((summary.get("seconds") or {}).values())
     height, width = summary.get("image_hw") or (0, 0)
+    used, given = len(summary.get("images") or ()), list((run.folder / PHOTOS).iterdir())
+    is_part = len(given) > used and not any(map(is_video, given))
     return render(
         "result.html.j2",
         answer=answer(summary),
@@ -142,13 +150,15 @@ def result(run: Run) -> str:
         warnings=[run.without_folders(text) for text in summary.get("warnings") or []],
         missing=run.sentence,
         facts=[
-            ("model", summary.get("model")), ("photos used", len(summary.get("images") or ())),
+            ("model", summary.get("model")), ("photos used", f"{used} of {len(given)}" if is_part else used),
             ("resolution", f"{width} × {height}"), ("time", duration(seconds)),
         ],
         licence=summary.get("licence_of_weights"),
         address=f"result/{run.token}",
         zip_name=ZIP_NAME,
         files=list(files(run)),
+        folder=run.folder if kept else None,
+        away=duration(AWAY_S),
     )  # fmt: skip
 
 
@@ -249,9 +259,9 @@ def build(sessions: Sessions, *, model: str) -> "gr.Blocks":
         gr.HTML(render("foot.html.j2"))
         timer = gr.Timer(TICK_S, active=False)
 
-        def state(session: Session) -> list[Any]:
+        def state(session: Session, *, gone: bool = False) -> list[Any]:
             """Update the panel, where it changed, the two buttons, and whether the page asks again."""
-            text = panel(sessions, session)
+            text = panel(sessions, session, gone=gone)
             same, session.shown = text == session.shown, text
             active = session.run is not None and session.run.is_active
             stopping = session.run is not None and session.run.stopping
@@ -288,7 +298,8 @@ def build(sessions: Sessions, *, model: str) -> "gr.Blocks":
             return [*state(session), trouble]
 
         def look(request: gr.Request) -> list[Any]:
-            return state(sessions.session(_key(request)))
+            session = sessions.session(_key(request))
+            return state(session, gone=session.run is None)  # only pages with a run ask
 
         def stop(request: gr.Request) -> list[Any]:
             session = sessions.session(_key(request))

@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 PREFIX = "freegeo-app-"
 UPLOADS = "uploads"
-AWAY_S = 600.0
+AWAY_S = 1800.0
 """How long a closed page may stay away before its run is ended and its files are removed."""
 IDLE_S = 24 * 3600.0
 """How long the files of an open page are kept after it was last used."""
