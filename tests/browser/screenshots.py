@@ -3,18 +3,23 @@
 import io
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from conftest import ARGUMENTS, CHROMIUM
+from freegeo.cli.sources import DEMO_DOMAIN, demo_scene
 from freegeo.data.photos import load_photos
+from freegeo.models.catalog import EMBEDDED_MODEL
 from freegeo.report.page import write_report
 from freegeo.report.viewer import open_viewer
 from freegeo.webapp.server import serving
 
 FIGURES = Path(__file__).parents[2] / "docs" / "figures"
 PORT, APP_PORT = 8437, 8438
+APP_ROOM, APP_PHOTOS = 1, 12
+"""Photos to which the embedded model adapts with success."""
 VIEWER_START_MS, SETTLE_MS, RUN_MS = 15_000, 1_500, 300_000
 
 
@@ -46,17 +51,19 @@ def main(folder: Path) -> None:
             notice.first.click()
         page.wait_for_timeout(SETTLE_MS)
         save(page, "viewer.png")
-        save_app(browser, sorted((folder / "photos").iterdir()))
+        save_app(browser)
         browser.close()
     viewer.close()
 
 
-def save_app(browser: Browser, photos: list[Path]) -> None:
-    """Let the web app reconstruct the photos with the embedded model, and store what it shows then."""
+def save_app(browser: Browser) -> None:
+    """Let the web app reconstruct photos of a generated room with the embedded model, and store what it shows then."""
     page = browser.new_page(viewport={"width": 1280, "height": 1150})
-    with serving(host="127.0.0.1", port=APP_PORT, model="freegeo-tiny"):
+    with TemporaryDirectory() as folder, serving(host="127.0.0.1", port=APP_PORT, model=EMBEDDED_MODEL):
+        for number, photo in enumerate(demo_scene(APP_ROOM, DEMO_DOMAIN).photos[:APP_PHOTOS]):
+            Image.fromarray(photo.read()).save(Path(folder, f"IMG_{2101 + number}.jpg"), quality=92)
         page.goto(f"http://127.0.0.1:{APP_PORT}")
-        page.set_input_files("#photos input[type=file]", photos)
+        page.set_input_files("#photos input[type=file]", sorted(Path(folder).iterdir()))
         page.wait_for_selector(".fg-strip")
         page.click("#start")
         page.wait_for_selector(".fg-result", timeout=RUN_MS)
