@@ -132,3 +132,10 @@ def test_a_page_whose_run_was_removed_says_so(tmp_path):
 
 def test_sentences_begin_with_a_capital_and_names_of_files_stay_as_they_are():
     assert [page.capital(text) for text in ("no photos", "a.jpg: damaged", "")] == ["No photos", "a.jpg: damaged", ""]
+
+
+def test_numbers_are_whole_or_left_out():
+    assert [page.whole_number(text, page.STEPS) for text in ("", " 7 ", "100")] == [None, 7, 100]
+    for text in ("0", "-1", "1.5", "many", "--steps"):
+        with pytest.raises(UserError, match=r"Training steps \(--steps\) is a whole number from 1 on"):
+            page.whole_number(text, page.STEPS)

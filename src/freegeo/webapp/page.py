@@ -52,6 +52,7 @@ NAME_RUN = """() => {
 WHAT_GUARD_DOES = (
     "select: matches between the photos decide whether the adapter is used; report: they are only asked; off"
 )
+STEPS, VIEWS = "Training steps (--steps)", "Most photos that are used (--max-views)"
 RECIPES = ("scene", "evidence")
 """Those for a visitor's own photos; the others reproduce published settings."""
 assert set(RECIPES) <= set(get_args(RecipeName))
@@ -224,14 +225,11 @@ def build(sessions: Sessions, *, model: str) -> "gr.Blocks":
                     elem_id="adapt",
                 )  # fmt: skip
                 with gr.Accordion("Advanced", open=False, elem_id="advanced"):
-                    steps = gr.Number(
-                        None, label="Training steps (--steps)", info="Empty: 100", precision=0, minimum=1,
-                        elem_id="steps",
-                    )  # fmt: skip
-                    views = gr.Number(
-                        MOST_VIEWS, label="Most photos that are used (--max-views)",
-                        info="Of more, as many are chosen evenly. More photos need more memory.", precision=0,
-                        minimum=1, elem_id="views",
+                    # Not numbers for Gradio, which makes an empty one 0.
+                    steps = gr.Textbox("", label=STEPS, placeholder="as the recipe says: 100", elem_id="steps")
+                    views = gr.Textbox(
+                        str(MOST_VIEWS), label=VIEWS, elem_id="views",
+                        info="Of more, as many are chosen evenly. More photos need more memory.",
                     )  # fmt: skip
                     recipe = gr.Radio(
                         list(RECIPES), value="scene", label="Recipe (--recipe)",
@@ -281,17 +279,15 @@ def build(sessions: Sessions, *, model: str) -> "gr.Blocks":
             return about_uploads(session)
 
         def begin(
-            model: str, adapt: bool, steps: float | None, views: float | None, recipe: str, guard: str, refine: str,
+            model: str, adapt: bool, steps: str, views: str, recipe: str, guard: str, refine: str,
             formats: list[str], skip_bad: bool, request: gr.Request,
         ) -> list[Any]:  # fmt: skip
-            session = sessions.session(_key(request))
-            choice = Choice(
-                model=model, adapt=adapt, steps=None if steps is None else int(steps),
-                max_views=None if views is None else int(views), recipe=recipe, guard=guard, refine=refine,
-                formats=tuple(formats), skip_bad=skip_bad,
-            )  # fmt: skip
-            trouble = ""
+            session, trouble = sessions.session(_key(request)), ""
             try:
+                choice = Choice(
+                    model=model, adapt=adapt, steps=whole_number(steps, STEPS), max_views=whole_number(views, VIEWS),
+                    recipe=recipe, guard=guard, refine=refine, formats=tuple(formats), skip_bad=skip_bad,
+                )  # fmt: skip
                 sessions.start(session, choice)
             except UserError as error:
                 trouble = render("trouble.html.j2", sentence=capital(str(error)))
@@ -323,6 +319,15 @@ def build(sessions: Sessions, *, model: str) -> "gr.Blocks":
         timer.tick(look, None, outputs, **quick)
         page.unload(leave)
     return page
+
+
+def whole_number(text: str, label: str) -> int | None:
+    """Read a number of at least 1; None for an empty field. UserError for anything else."""
+    if not text.strip():
+        return None
+    if not text.strip().isdecimal() or int(text) < 1:
+        raise UserError(f"{label} is a whole number from 1 on, got '{text}'.")
+    return int(text)
 
 
 def _key(request: "gr.Request") -> str:
