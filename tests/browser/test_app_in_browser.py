@@ -113,7 +113,6 @@ def test_photos_become_a_result(open_page, app, photos):
     page.click("#start")
     page.wait_for_selector(".fg-running")
     assert page.locator("#trouble .fg-sentence").count() == 0
-    page.wait_for_selector(".fg-now .fg-bar", timeout=RUN_MS)
     text = outcome(page)
     assert text.startswith("Did it help?")
     assert re.search(r"Adaptation: (yes|no|unknown)\.", text)

@@ -1,5 +1,6 @@
 """The page: what its controls are called, what each does, and what its panel shows. Gradio draws it."""
 
+# Annotations are values here, not text: Gradio looks for `gr.Request` among those of functions inside a function.
 import base64
 import io
 import logging
@@ -53,9 +54,8 @@ WHAT_GUARD_DOES = (
     "select: matches between the photos decide whether the adapter is used; report: they are only asked; off"
 )
 STEPS, VIEWS = "Training steps (--steps)", "Most photos that are used (--max-views)"
-RECIPES = ("scene", "evidence")
+RECIPES: tuple[RecipeName, ...] = ("scene", "evidence")
 """Those for a visitor's own photos; the others reproduce published settings."""
-assert set(RECIPES) <= set(get_args(RecipeName))
 
 
 def models() -> list[ModelEntry]:
