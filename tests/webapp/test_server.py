@@ -113,6 +113,10 @@ def test_all_models_can_be_chosen_with_licence_and_size():
     assert [item.name for item in found] == catalog.names()
     for item in found:
         assert item.licence in page.about_model(item)
+    names = ("da3-base", "da3-large", "vggt-1b-commercial")
+    shown = [page.short_licence(catalog.entry(name)) for name in names]
+    assert shown == ["Apache-2.0", "CC BY-NC 4.0, non-commercial", "VGGT License"]
+    assert ["fg-caution" in page.about_model(catalog.entry(name)) for name in names] == [False, True, True]
     assert page.download_of(catalog.entry("freegeo-tiny")) == "included"
     assert page.download_of(catalog.entry("da3-base")) == "0.5 GB"
 

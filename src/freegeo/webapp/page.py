@@ -79,6 +79,12 @@ def download_of(item: ModelEntry) -> str:
     return "included" if item.packaged_weights else "no download"
 
 
+def short_licence(item: ModelEntry) -> str:
+    """Return the name of the weights' licence, and whether it forbids commercial use; `about_model` has all of it."""
+    name, _, details = item.licence.partition(" (")
+    return f"{name}, non-commercial" if details.startswith("non-commercial") else name
+
+
 def about_model(item: ModelEntry) -> str:
     """Return the note below the choice of the model, as HTML."""
     return render("model.html.j2", item=item, download=download_of(item))
@@ -210,7 +216,7 @@ def build(sessions: Sessions, *, model: str) -> "gr.Blocks":
     import gradio as gr
 
     entries = {item.name: item for item in models()}
-    choices = [(f"{name} · {item.licence} · {download_of(item)}", name) for name, item in entries.items()]
+    choices = [(f"{name} · {short_licence(item)} · {download_of(item)}", name) for name, item in entries.items()]
     with gr.Blocks(analytics_enabled=False, title="freegeo", fill_width=True) as page:
         gr.HTML(render("head.html.j2"))
         with gr.Row(elem_id="columns"):
