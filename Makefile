@@ -4,7 +4,7 @@ BIN := .venv/bin
 READY := .venv/ready
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo torture test test-slow test-browser test-oracle test-matrix parity lint format lock licences audit clean
+.PHONY: demo docs torture test test-slow test-browser test-oracle test-matrix parity lint format lock licences audit clean
 
 demo: $(READY)
 	$(BIN)/freegeo demo --output out/demo
@@ -21,6 +21,10 @@ test-browser: $(READY)
 test-oracle: $(READY)
 	$(BIN)/pip install -q -c constraints.txt -e '.[oracle]'
 	$(PYTEST) -m oracle
+
+# Strictly: a broken link, a page that is nowhere in the navigation and a public name without a docstring fail.
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -d out/site
 
 # Damages every kind of file that is read. TORTURE: number of cases and seed.
 TORTURE := 20000 1
