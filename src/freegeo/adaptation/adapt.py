@@ -106,6 +106,7 @@ class Adapted:
             "scenes": list(self.scenes),
             "precision": self.precision,
             "with_cameras": self.with_cameras,
+            "process_res": self.adapter.process_res,
             "windows": list(self.windows),
             "loss_curve": self.curve,
             # JSON has no infinity.
@@ -301,13 +302,20 @@ class _Run:
     """Shares of the steps after which the adapter's state is kept -> how many finished steps that are."""
 
 
+def _process_res(run: _Run) -> int | None:
+    """Return the longest side of the images of a run; None for squares of the recipe's own, whatever is predicted."""
+    if run.recipe.squash is not None:
+        return None
+    return run.scenes[0].process_res or run.model.spec.default_side
+
+
 def _train(run: _Run, plan: Plan) -> Adapted:
     """Attach an adapter, train it or go on training it, and look at what came out."""
     started, recipe, steps = time.monotonic(), run.recipe, run.steps
     model = run.model.to(run.compute.device)
     adapter = Adapter.attach(
         model, rank=recipe.rank, alpha=recipe.alpha, dropout=recipe.dropout,
-        generator=torch.Generator().manual_seed(run.seed),
+        generator=torch.Generator().manual_seed(run.seed), process_res=_process_res(run),
     )  # fmt: skip
     result = Adapted(
         adapter=adapter, recipe=recipe, seed=run.seed, scenes=tuple(scene.name for scene in run.scenes),
@@ -541,13 +549,15 @@ class _State:
     def _identity(self) -> str:
         """Return a fingerprint of model name, scenes, recipe, seed and precision; pixels and weights are left out.
 
-        Targets and priors of a scene are in it, which depend on more than the photos, and its windows.
+        Targets and priors of a scene are in it, which depend on more than the photos, its windows, and the size of its
+        images where that is not the model's default.
         """
         scenes = [
             (
                 scene.name,
                 scene.count,
                 *(part and part.digest() for part in (scene.targets, scene.priors)),
+                *(() if scene.process_res is None else (scene.process_res,)),
                 *(scene.windows or ()),
             )
             for scene in self.run.scenes

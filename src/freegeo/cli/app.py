@@ -53,6 +53,7 @@ COMMANDS = {
     "view": ("freegeo.cli.view:view", "Look at results in the browser, before and after adaptation."),
     "bench": ("freegeo.cli.bench:app", "Published evaluation: datasets, tables, comparison with the paper."),
     "models": ("freegeo.cli.models:app", "List, describe, download and check models."),
+    "doctor": ("freegeo.cli.doctor:doctor", "Say what is installed, what is broken, and what to do next."),
     "train-tiny": ("freegeo.cli.train_tiny:train_tiny", "Train the embedded model on generated rooms."),
 }
 
