@@ -15,7 +15,7 @@ import torch
 
 from freegeo.adaptation import adapter_files
 from freegeo.adaptation import recipe as recipes
-from freegeo.adaptation.adapt import Adapted, Progress
+from freegeo.adaptation.adapt import Adapted, OwnLoss, Progress
 from freegeo.adaptation.adapt import adapt as train_adapter
 from freegeo.adaptation.adapter import Adapter, is_adapted
 from freegeo.adaptation.memory import plan_reconstruction
@@ -323,6 +323,7 @@ def adapt(
     mixed: Mixed = MIXED,
     process_res: int | None = None,
     guard: Guard = "select",
+    own_loss: OwnLoss | None = None,
     resume_in: str | Path | None = None,
     progress: bool = False,
     on_step: Callable[[Progress], None] = lambda progress: None,
@@ -357,6 +358,9 @@ def adapt(
         process_res: longest side of the model's images, as for `reconstruct`.
         guard: `select`: matches between the photos decide in which state the adapter is used, and whether at all (its
             strength is 0 then; `result.verdict` says why); `report`: they are only asked; `off`.
+        own_loss: a term of your own that is added to the loss. At every step it is called with the features of student
+            and teacher, both of the views that the student sees (`freegeo.types.Features`), and returns a tensor with
+            one number. The curve has it as `own`. A run is continued only with a function of the same name.
         resume_in: folder for the state of an unfinished run: the same call continues it. `result.save` to that folder
             removes the state.
         progress: show a bar in a terminal or notebook, lines in a log file; without it nothing is printed.
@@ -390,7 +394,7 @@ def adapt(
     with step_bar(on_step) if progress else nullcontext(on_step) as follow:
         result = train_adapter(
             model, images, plan, seed=seed, compute=compute, resume_in=folder, on_step=follow,
-            keep_after=() if guard == "off" else SHARES,
+            keep_after=() if guard == "off" else SHARES, own_loss=own_loss,
         )  # fmt: skip
     if not result.trouble:
         scene = Evidence.in_memory(
