@@ -12,7 +12,7 @@ import freegeo
 from freegeo.data.photos import MemoryPhoto
 from freegeo.errors import UserError
 from freegeo.files import read_json
-from freegeo.models import da3, da3_images, vggt, vggt_images
+from freegeo.models import catalog, da3, da3_images, vggt, vggt_images
 from freegeo.models.da3_config import EMBEDDED, SMALL
 from freegeo.models.images import chosen_side, look_at_photos, read_photos
 from freegeo.models.vggt_config import VGGT_1B
@@ -74,6 +74,16 @@ def test_positions_are_made_for_every_grid_that_may_be_asked_for(part, config):
         found = part.position_embedding(learned, (n, 3))
         assert found.shape == (1, 1 + 3 * n, 1)
         assert found[0, 0, 0] == 0, "the class token keeps its own"
+
+
+@pytest.mark.parametrize("side", [287, 400])
+def test_pi3_is_asked_for_the_pixels_of_a_photo_of_that_side(side):
+    model = catalog.build_empty("pi3")
+    for size in ((300, 400), (200, 600)):
+        batch = read_photos(model, photos(size), process_res=side)
+        height, width = batch.image_hw
+        assert 0.9 * side**2 * 3 / 4 <= height * width <= side**2 * 3 / 4 * 1.04
+        assert abs(width / height - size[1] / size[0]) < 0.2
 
 
 @BOTH

@@ -171,7 +171,6 @@ class Pi3(ReconstructionModel):
         return [name for i, block in enumerate(self.decoder) for name in block_linears(f"decoder.{i}", block)]
 
     def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED, process_res: int | None = None) -> ImageBatch:
-    def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED, process_res: int | None = None) -> ImageBatch:
         """Resize to the number of pixels that the model was trained with, the aspect kept up to whole patches.
 
         Another side asks for the number of pixels that a 4:3 photo of that side has.
