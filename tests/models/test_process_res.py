@@ -12,10 +12,9 @@ import freegeo
 from freegeo.data.photos import MemoryPhoto
 from freegeo.errors import UserError
 from freegeo.files import read_json
-from freegeo.models import catalog, da3, da3_images, vggt, vggt_images
+from freegeo.models import catalog, da3, da3_images, vggt_images
 from freegeo.models.da3_config import EMBEDDED, SMALL
 from freegeo.models.images import chosen_side, look_at_photos, read_photos
-from freegeo.models.vggt_config import VGGT_1B
 from tiny_models import tiny_da3, tiny_vggt
 
 QUICK = {"steps": 2, "sets": 1, "guard": "off"}
@@ -65,13 +64,12 @@ def test_photos_are_read_at_the_side_that_is_asked_for(build):
     assert torch.allclose(large[:2], 2 * small[:2])
 
 
-@pytest.mark.parametrize(
-    ("part", "config"), [(da3.Backbone, SMALL), (da3.Backbone, EMBEDDED), (vggt.PatchEncoder, VGGT_1B)]
-)  # fmt: skip
-def test_positions_are_made_for_every_grid_that_may_be_asked_for(part, config):
+@pytest.mark.parametrize("config", [SMALL, EMBEDDED])
+def test_positions_are_made_for_every_grid_that_may_be_asked_for(config):
+    """DA3 asks for a scale, from which the number of rows follows by rounding; VGGT and Pi3 ask for the number."""
     learned = SimpleNamespace(config=config, pos_embed=torch.arange(config.position_grid**2 + 1.0).view(1, -1, 1))
     for n in range(1, 4 * config.position_grid + 1):
-        found = part.position_embedding(learned, (n, 3))
+        found = da3.Backbone.position_embedding(learned, (n, 3))
         assert found.shape == (1, 1 + 3 * n, 1)
         assert found[0, 0, 0] == 0, "the class token keeps its own"
 
