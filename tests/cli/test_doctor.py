@@ -11,7 +11,7 @@ import pytest
 from huggingface_hub import constants
 
 from freegeo.cli import doctor
-from freegeo.models import catalog
+from freegeo.models import catalog, hub
 
 BROKEN = {
     "viser": "raise ImportError('libX.so.1 is missing')",
@@ -103,6 +103,17 @@ def test_without_torch_the_rest_is_still_said(few, monkeypatch, freegeo, is_ther
     assert (
         "torch cannot be loaded (OSError: libtorch.so" if is_there else "torch is missing: pip"
     ) in outcome.sentence()
+    assert "pip install 'freegeo[view]'" in outcome.out
+
+
+def test_a_hub_library_that_does_not_load_is_broken(few, monkeypatch, freegeo):
+    def fail():
+        raise ImportError("cannot import name 'x'")
+
+    monkeypatch.setattr(hub, "cache_folder", fail)
+    outcome = freegeo("doctor")
+    assert outcome.code == 1
+    assert "huggingface_hub, which freegeo needs, cannot be loaded (ImportError: cannot import" in outcome.sentence()
     assert "pip install 'freegeo[view]'" in outcome.out
 
 

@@ -9,12 +9,15 @@ import pytest
 import torch
 
 import freegeo
+from freegeo.adaptation import memory
+from freegeo.cli.options import SequenceOptions
 from freegeo.data.photos import MemoryPhoto
 from freegeo.errors import UserError
 from freegeo.files import read_json
 from freegeo.models import catalog, da3, da3_images, vggt_images
 from freegeo.models.da3_config import EMBEDDED, SMALL
 from freegeo.models.images import chosen_side, look_at_photos, read_photos
+from freegeo.models.precision import Compute
 from tiny_models import tiny_da3, tiny_vggt
 
 QUICK = {"steps": 2, "sets": 1, "guard": "off"}
@@ -155,3 +158,21 @@ def test_a_recipe_with_squares_of_its_own_says_that_it_keeps_to_them(caplog):
     result = freegeo.adapt(sized(), photos(*FOUR), recipe=squashing, process_res=48, device="cpu", guard="off")
     assert "adapts to images of 32 x 32 pixels whatever is asked for: --process-res 48" in caplog.text
     assert result.adapter.process_res is None
+
+
+def test_the_memory_planner_and_chunks_count_the_pixels_that_are_asked_for(monkeypatch):
+    model, found = sized(), photos(*FOUR * 3)
+    sizes = {side: sum(size for _, size in planned(model, found, side)) for side in (32, 128)}
+    budget = sum(sizes.values()) // 2
+    monkeypatch.setattr(memory, "available", lambda device, model: budget)
+    options = SequenceOptions(chunk="12")
+    assert options.plan(model, found, "crop", Compute()) is None
+    with pytest.raises(UserError, match=r"at most .* photos of 128 x 96 pixels fit into memory"):
+        options.plan(model, found, "crop", Compute(), process_res=128)
+    with pytest.raises(UserError, match=r"12 images of 128 x 96 pixels .* use at most"):
+        freegeo.reconstruct(model, found, process_res=128, device="cpu")
+
+
+def planned(model, found, side):
+    image_hw = read_photos(model, found, process_res=side).image_hw
+    return memory.plan_reconstruction(model, len(found), image_hw, compute=Compute(), budget=10**9)[0]

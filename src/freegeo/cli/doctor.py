@@ -209,18 +209,32 @@ def _look_at_torch(found: Findings, gpus: Sequence[str]) -> None:
 
 def _look_at_machine(found: Findings) -> None:
     from freegeo.host import host_available
-    from freegeo.models.hub import cache_folder
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     found.cores, found.memory_free = cores or 1, host_available()
-    for place in dict.fromkeys((Path.cwd(), cache_folder())):
+    cache = _cache(found)
+    for place in filter(None, dict.fromkeys((Path.cwd(), cache))):
         existing = next(folder for folder in (place, *place.parents) if folder.exists())
         found.disk_free[str(place)] = shutil.disk_usage(existing).free
-        if not os.access(existing, os.W_OK) and place == cache_folder():
+        if place == cache and not os.access(existing, os.W_OK):
             found.broken.append(
                 f"{existing} cannot be written to, where models are kept: set HF_HOME to another folder."
             )
-    found.hub = {"cache": str(cache_folder()), **{name: os.environ.get(name) for name in SETTINGS}}
+    found.hub = {"cache": None if cache is None else str(cache), **{name: os.environ.get(name) for name in SETTINGS}}
+
+
+def _cache(found: Findings) -> Path | None:
+    """Return where models are kept; None where the library that knows does not load."""
+    from freegeo.models.hub import cache_folder
+
+    try:
+        return cache_folder()
+    except Exception as error:
+        if _version("huggingface_hub"):
+            found.broken.append(
+                f"huggingface_hub, which freegeo needs, cannot be loaded ({_reason(error)}): reinstall it."
+            )
+        return None
 
 
 def _look_at_packages(found: Findings, loaded: Mapping[str, str | None]) -> None:
@@ -251,11 +265,11 @@ def _look_at_packages(found: Findings, loaded: Mapping[str, str | None]) -> None
 
 def _requirements() -> tuple[list[Any], dict[str, list[Any]]]:
     """Return what freegeo needs, and what each extra needs, as its metadata say; nothing for bare source files."""
-    from packaging.requirements import Requirement
-
     try:
+        from packaging.requirements import Requirement
+
         found = [Requirement(text) for text in metadata.requires("freegeo") or []]
-    except metadata.PackageNotFoundError:
+    except (ImportError, metadata.PackageNotFoundError):
         return [], {}
     always = [one for one in found if one.marker is None or one.marker.evaluate({"extra": ""})]
     extras = {
@@ -289,8 +303,8 @@ def _look_at_models(found: Findings) -> None:
     from freegeo.models import catalog
     from freegeo.models.hub import cached_file
 
-    if found.torch is None:
-        return  # which plug-ins and the check of a file's length need
+    if found.torch is None or found.hub["cache"] is None:
+        return  # plug-ins and the check of a file's length need both
     for name in catalog.names():
         try:
             item = catalog.entry(name)
@@ -313,13 +327,13 @@ def _advise(found: Findings) -> None:
 
     states = {extra.name: extra for extra in found.extras}
     if found.torch and not found.devices and not found.next and not found.broken:
-        found.next.append("No GPU: models run on the CPU, where da3-small is the quickest of the published ones.")
+        found.next.append("No GPU: models run on the CPU, where da3-small is the smallest of the published ones.")
     if states["colmap"].state == "missing":
         found.next.append(f"Without pycolmap, cameras are not refined after adapting: {states['colmap'].install}.")
     for model in found.models:
         if not model.complete:
             found.next.append(f"{model.name} is not complete: `freegeo models download {model.name}` completes it.")
-    if found.torch and not any(model.complete for model in found.models):
+    if found.torch and found.hub["cache"] and not any(model.complete for model in found.models):
         item = catalog.entry(catalog.DEFAULT_MODEL)
         size = f"{item.download_bytes / 1e9:.1f} GB"
         found.next.append(
