@@ -140,6 +140,15 @@ def test_models_of_the_cache_are_listed_whole_or_not(few, freegeo):
     assert outcome.code == 0
 
 
+def test_settings_of_the_hub_are_shown_without_passwords(few, monkeypatch, freegeo):
+    monkeypatch.setenv("HF_ENDPOINT", "https://me:secret@hub.example")
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    out = freegeo("doctor").out
+    assert "HF_HUB_OFFLINE=1, HF_ENDPOINT=https://hub.example; not asked whether it can be reached" in out
+    assert "secret" not in out
+    assert "HF_HUB_OFFLINE is set, which forbids downloads" in out
+
+
 def test_weights_that_are_missing_from_the_package_are_broken(few, monkeypatch, freegeo):
     entries = {name: catalog.entry(name) for name in ("da3-base", "freegeo-tiny")}
     entries["freegeo-tiny"] = replace(entries["freegeo-tiny"], packaged_weights=few / "gone.safetensors")

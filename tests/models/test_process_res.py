@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +17,7 @@ from freegeo.errors import UserError
 from freegeo.files import read_json
 from freegeo.models import catalog, da3, da3_images, vggt_images
 from freegeo.models.da3_config import EMBEDDED, SMALL
-from freegeo.models.images import chosen_side, look_at_photos, read_photos
+from freegeo.models.images import SIDE_FACTOR, chosen_side, look_at_photos, read_photos
 from freegeo.models.precision import Compute
 from tiny_models import tiny_da3, tiny_vggt
 
@@ -176,3 +177,16 @@ def test_the_memory_planner_and_chunks_count_the_pixels_that_are_asked_for(monke
 def planned(model, found, side):
     image_hw = read_photos(model, found, process_res=side).image_hw
     return memory.plan_reconstruction(model, len(found), image_hw, compute=Compute(), budget=10**9)[0]
+
+
+@pytest.mark.parametrize(
+    ("row", "name"), [("DA3", "da3-base"), ("VGGT", "vggt-1b"), ("Pi3", "pi3"), ("freegeo-tiny", "freegeo-tiny")]
+)
+def test_the_docs_name_the_sides(row, name):
+    page = (Path(__file__).parents[2] / "docs" / "photos.md").read_text(encoding="utf-8")
+    (line,) = [line for line in page.splitlines() if line.startswith(f"| {row} |")]
+    spec = catalog.build_empty(name).spec
+    _, _, default, _, quiet, ends, _ = (cell.strip() for cell in line.split("|"))
+    assert default.split()[0] == str(spec.default_side)
+    assert quiet == f"{spec.sides[0]} to {spec.sides[1]}"
+    assert ends == f"{spec.default_side // SIDE_FACTOR}, {spec.default_side * SIDE_FACTOR}"

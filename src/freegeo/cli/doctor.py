@@ -220,7 +220,14 @@ def _look_at_machine(found: Findings) -> None:
             found.broken.append(
                 f"{existing} cannot be written to, where models are kept: set HF_HOME to another folder."
             )
-    found.hub = {"cache": None if cache is None else str(cache), **{name: os.environ.get(name) for name in SETTINGS}}
+    found.hub = {"cache": None if cache is None else str(cache), **{name: _setting(name) for name in SETTINGS}}
+
+
+def _setting(name: str) -> str | None:
+    from freegeo.models.hub import without_password
+
+    value = os.environ.get(name)
+    return None if value is None else without_password(value)
 
 
 def _cache(found: Findings) -> Path | None:

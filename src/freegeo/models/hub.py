@@ -323,10 +323,11 @@ def _licence_first(item: HubFile) -> str:
 def _settings(*names: str) -> str:
     """Return the environment variables among `names` that are set, in either case, without passwords."""
     found = [(name, value) for name, value in sorted(os.environ.items()) if name.upper() in names and value]
-    return " and ".join(f"{name}={_without_password(value)}" for name, value in found)
+    return " and ".join(f"{name}={without_password(value)}" for name, value in found)
 
 
-def _without_password(address: str) -> str:
+def without_password(address: str) -> str:
+    """Return an address without the name and password in it."""
     return _PASSWORD.sub(r"\1", address)
 
 
