@@ -88,6 +88,12 @@ def test_pi3_is_asked_for_the_pixels_of_a_photo_of_that_side(side):
         assert abs(width / height - size[1] / size[0]) < 0.2
 
 
+def test_mapanything_s_sizes_are_scaled():
+    model = catalog.build_empty("map-anything")
+    sizes = {side: read_photos(model, photos((300, 400)), process_res=side).image_hw for side in (518, 259, 756)}
+    assert sizes == {518: (392, 518), 259: (196, 252), 756: (574, 756)}
+
+
 @BOTH
 def test_the_network_computes_at_other_sides(build):
     model = sized(build)
@@ -180,7 +186,14 @@ def planned(model, found, side):
 
 
 @pytest.mark.parametrize(
-    ("row", "name"), [("DA3", "da3-base"), ("VGGT", "vggt-1b"), ("Pi3", "pi3"), ("freegeo-tiny", "freegeo-tiny")]
+    ("row", "name"),
+    [
+        ("DA3", "da3-base"),
+        ("VGGT", "vggt-1b"),
+        ("Pi3", "pi3"),
+        ("MapAnything", "map-anything"),
+        ("freegeo-tiny", "freegeo-tiny"),
+    ],
 )
 def test_the_docs_name_the_sides(row, name):
     page = (Path(__file__).parents[2] / "docs" / "photos.md").read_text(encoding="utf-8")
