@@ -236,7 +236,7 @@ def adapt(
         if plan.checkpointing and plan.place == "disk":
             raise FreeGeoError(
                 f"{compute.device} ran out of memory even with activation checkpointing and teacher features on disk. "
-                "Use smaller images, fewer --views, --precision bf16 or a smaller model."
+                "Use smaller images (--process-res), fewer --views, --precision bf16 or a smaller model."
             ) from None
     # Outside the except block the exception no longer keeps the tensors of the failed run alive.
     logger.warning(
