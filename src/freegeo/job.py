@@ -48,6 +48,7 @@ from freegeo.pipeline import (
     capital,
     judge_by_photos,
     not_finite,
+    other_size,
     other_use,
     predict,
     predict_unchecked,
@@ -198,7 +199,10 @@ class Job:
         doubt = about.get("trouble") or (verdict.get("reason") if verdict.get("outcome") != "adapted" else None)
         if doubt:
             self._warn(f"{self.adapter}: an adapter to be doubted. {capital(doubt)}")
-        return adapter_files.load_adapter(self.model, self.adapter)
+        found = adapter_files.load_adapter(self.model, self.adapter)
+        if said := other_size(self.model, self.batch):
+            self._warn(f"{self.adapter}: {said}")
+        return found
 
     @property
     def _attached(self) -> Adapter | None:
@@ -468,6 +472,7 @@ class Job:
             "images": list(final.names),
             "photo_files": None if photos is None else photo_records(photos),
             "image_hw": list(final.image_hw),
+            "process_res": self.batch.process_res or self.spec.default_side,
             "scale": None if final.scale is None else asdict(final.scale),
             "adapter": ADAPTER_FOLDER if adaptation.used else (str(self.adapter) if self.adapter else None),
             "rejected_adapter": None if adaptation.used or self.recipe is None else why_not,

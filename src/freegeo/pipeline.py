@@ -15,9 +15,9 @@ import torch
 
 from freegeo.adaptation import adapter_files
 from freegeo.adaptation import recipe as recipes
-from freegeo.adaptation.adapt import Adapted, Progress
+from freegeo.adaptation.adapt import Adapted, OwnLoss, Progress
 from freegeo.adaptation.adapt import adapt as train_adapter
-from freegeo.adaptation.adapter import Adapter
+from freegeo.adaptation.adapter import Adapter, is_adapted
 from freegeo.adaptation.memory import plan_reconstruction
 from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Guard, Recipe
 from freegeo.adaptation.samples import SceneImages
@@ -154,6 +154,7 @@ def reconstruct(
     precision: str | None = None,
     max_views: int = MAX_VIEWS,
     mixed: Mixed = MIXED,
+    process_res: int | None = None,
     pose_from: PoseFrom = "camera",
 ) -> Reconstruction:
     """Reconstruct photos: depth, confidence and cameras of every view.
@@ -176,6 +177,8 @@ def reconstruct(
         mixed: how photos of different shapes become images of one size: `crop` fits the odd ones to the others, `pad`
             puts white around all, `upstream` is the rule of the model's authors. Cutting more than 10 % of a photo
             gives a warning.
+        process_res: longest side of the model's images in pixels, rounded to whole patches; None: the model's default.
+            More takes more memory and time. An adapter should be used at the size that it was trained at.
         pose_from: `camera`: cameras of the model's camera head; `rays`: found from the rays that an any-view model of
             DA3 predicts.
 
@@ -190,13 +193,15 @@ def reconstruct(
         require_cameras(model.spec)
     found, known, matches = _with_cameras(load_photos(photos, max_views), cameras, trust=trust_cameras)
     source = None if scale is None else read_scale(scale, found)
-    batch = read_photos(model, found, mixed=mixed)
+    batch = read_photos(model, found, mixed=mixed, process_res=process_res)
     priors = _told(known, batch, model.spec)
     if isinstance(adapter, str | Path):
         about = adapter_files.adapter_metadata(adapter_files.find_adapter(adapter)) or {}
         if said := other_use(about, priors):
             logger.warning("%s: %s", adapter, said)
     with _applied(model, adapter):
+        if said := other_size(model, batch):
+            logger.warning("%s", said)
         result = predict(model, batch, reference=reference, priors=priors, pose_from=pose_from, compute=compute)
     if known is not None:
         posed = with_known_cameras(result, known)
@@ -265,6 +270,17 @@ def other_use(metadata: Mapping[str, Any], priors: Priors | None) -> str | None:
     return f"the adapter was trained {with_or_without} them, for which it was not made."
 
 
+def other_size(model: ReconstructionModel, batch: ImageBatch) -> str | None:
+    """Say that the adapter that is on was trained at another size than that of the images; None where it was not."""
+    part, size = model.cross_view, batch.process_res or model.spec.default_side
+    if part is None or not is_adapted(part) or part.adapted_at in (None, size):
+        return None
+    return (
+        f"the adapter was trained on images of {part.adapted_at} pixels and is used on {size}, for which it was not "
+        f"made: take --process-res {part.adapted_at}, or adapt again."
+    )
+
+
 @contextmanager
 def _loaded(model: ReconstructionModel, folder: str | Path) -> Generator[None]:
     adapter = load_adapter(model, folder)
@@ -305,7 +321,9 @@ def adapt(
     precision: str | None = None,
     max_views: int = MAX_VIEWS,
     mixed: Mixed = MIXED,
+    process_res: int | None = None,
     guard: Guard = "select",
+    own_loss: OwnLoss | None = None,
     resume_in: str | Path | None = None,
     progress: bool = False,
     on_step: Callable[[Progress], None] = lambda progress: None,
@@ -337,8 +355,12 @@ def adapt(
         precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
         max_views: most photos that are used; a list that `freegeo.load_photos` returned is used whole.
         mixed: how photos of different shapes become images of one size, as for `reconstruct`.
+        process_res: longest side of the model's images, as for `reconstruct`.
         guard: `select`: matches between the photos decide in which state the adapter is used, and whether at all (its
             strength is 0 then; `result.verdict` says why); `report`: they are only asked; `off`.
+        own_loss: a term of your own that is added to the loss. At every step it is called with the features of student
+            and teacher, both of the views that the student sees (`freegeo.types.Features`), and returns a tensor with
+            one number. The curve has it as `own`. A run is continued only with a function of the same name.
         resume_in: folder for the state of an unfinished run: the same call continues it. `result.save` to that folder
             removes the state.
         progress: show a bar in a terminal or notebook, lines in a log file; without it nothing is printed.
@@ -362,7 +384,7 @@ def adapt(
     found = load_photos(photos, max_views)
     require_enough_photos(found)
     found, known, _ = _with_cameras(found, cameras, trust=trust_cameras)
-    batch = read_photos(model, found, mixed=mixed)
+    batch = read_photos(model, found, mixed=mixed, process_res=process_res)
     priors = _told(known, batch, model.spec)
     images = [scene_images("photos", found, model, plan, batch, priors)]
     images, frozen, judging = before_training(
@@ -372,7 +394,7 @@ def adapt(
     with step_bar(on_step) if progress else nullcontext(on_step) as follow:
         result = train_adapter(
             model, images, plan, seed=seed, compute=compute, resume_in=folder, on_step=follow,
-            keep_after=() if guard == "off" else SHARES,
+            keep_after=() if guard == "off" else SHARES, own_loss=own_loss,
         )  # fmt: skip
     if not result.trouble:
         scene = Evidence.in_memory(
@@ -555,6 +577,11 @@ def scene_images(
     if recipe.squash is None:
         scene = SceneImages.from_batch(name, batch)
     else:
+        if batch.process_res is not None:
+            logger.warning(
+                "recipe %s adapts to images of %d x %d pixels whatever is asked for: --process-res %d is the size of "
+                "predictions alone.", recipe.name, recipe.squash, recipe.squash, batch.process_res,
+            )  # fmt: skip
         scene = SceneImages.from_photos(name, photos, model, recipe)
     return replace(scene, priors=priors)
 

@@ -52,6 +52,8 @@ class ImageBatch:
     """(S, 2) float64."""
     offset_xy: Tensor
     """(S, 2) float64: negative where the photo is cropped, positive where it is padded."""
+    process_res: int | None = None
+    """Longest side that was asked for; None: the model's default."""
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -76,7 +78,8 @@ class ImageBatch:
     def select(self, views: Sequence[int]) -> Self:
         """Return the chosen views, in the order given."""
         index = torch.as_tensor(list(views), dtype=torch.long)
-        tensors = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "names"}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        tensors = {name: value[index] for name, value in values.items() if isinstance(value, Tensor)}
         return replace(self, names=tuple(self.names[i] for i in views), **tensors)
 
     def read(self) -> ImageBatch:

@@ -15,7 +15,7 @@ from torch import nn
 
 from freegeo.adaptation import adapt as adapting
 from freegeo.adaptation.adapt import adapt, learning_rate, loss_change, trouble
-from freegeo.adaptation.adapter import Adapter, PackedDropout
+from freegeo.adaptation.adapter import Adapter, PackedDropout, is_adapted
 from freegeo.adaptation.losses import adaptation_loss, draw_tokens, feature_distance
 from freegeo.adaptation.memory import Plan
 from freegeo.adaptation.recipe import evidence, paper, released
@@ -799,3 +799,47 @@ def test_a_recipe_that_learns_cameras_refuses_a_sequence_in_chunks():
 def test_windows_of_frames_that_are_not_there_are_refused(window):
     with pytest.raises(ValueError, match="ascending numbers below 9"):
         in_windows(9, (0, 1, 2), window)
+
+
+# -- a term of the user's own
+
+
+def test_a_term_of_one_s_own_is_added_to_the_loss_and_named(tmp_path):
+    seen = []
+
+    def far_from_teacher(student, teacher):
+        layer = max(student.levels)
+        assert student.levels.keys() == teacher.levels.keys()
+        ours, theirs = student.levels[layer][0], teacher.levels[layer][0]
+        assert ours.shape == theirs.shape and not theirs.requires_grad
+        seen.append(ours.shape[1])
+        return 3 * (ours - theirs).square().mean()
+
+    curves, ends = [], []
+    for own_loss in (None, far_from_teacher):
+        model = tiny_da3()
+        result = adapt(model, [noise_scene(8)], quick(model), seed=1, own_loss=own_loss)
+        curves.append(result.curve)
+        ends.append(tensors(result))
+        result.save(tmp_path)
+    assert set(seen) == {4}, "the views of the student"
+    first, with_own = curves[0][0], curves[1][0]
+    assert with_own["total"] == pytest.approx(first["total"] + with_own["own"], rel=1e-5)
+    assert with_own["own"] > 0
+    assert not same(*ends)
+    assert json.loads((tmp_path / "freegeo.json").read_text())["own_loss"].endswith("far_from_teacher")
+
+
+@pytest.mark.parametrize(
+    ("term", "words"),
+    [
+        (lambda student, teacher: 0.5, "it returned float"),
+        (lambda student, teacher: student.levels[max(student.levels)][0], r"it returned a tensor of \("),
+        (lambda student, teacher: teacher.levels[max(teacher.levels)][0].mean(), "from which nothing is learned"),
+    ],
+)
+def test_terms_that_are_no_loss_are_refused(term, words):
+    model = tiny_da3()
+    with pytest.raises(UserError, match=words):
+        adapt(model, [noise_scene(4)], quick(model), seed=1, own_loss=term)
+    assert not is_adapted(model)

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from freegeo import __version__
+from freegeo.adaptation.needs import model_needs
 from freegeo.cli import app, console
 from freegeo.cli.app import COMMANDS, main
-from freegeo.cli.models import adaptation_bytes, reconstruction_bytes
 from freegeo.models import catalog
 
 
@@ -319,8 +319,9 @@ def test_models_fit_a_terminal_and_name_every_licence(freegeo):
     lines = outcome.out.splitlines()
     assert max(map(len, lines)) <= 100
     for name in catalog.names():
-        (line,) = [line for line in lines if line.split()[:1] == [name]]
-        assert catalog.entry(name).licence.split(" (")[0] in line
+        about, numbers = [line for line in lines if line.split()[:1] == [name]]
+        assert about.split(maxsplit=1)[1].split(" ")[0] == catalog.entry(name).about.split(" ")[0]
+        assert catalog.entry(name).licence.split(" (")[0] in numbers
 
 
 @pytest.mark.parametrize(
@@ -340,30 +341,32 @@ def test_describe_counts_what_an_adapter_trains(freegeo, name, counts):
         assert count in outcome.out
 
 
-def test_models_show_the_download_and_the_memory(freegeo):
-    lines = {line.split()[0]: line for line in freegeo("models").out.splitlines() if line.strip()}
-    assert "5.4 GB" in lines["da3-giant"] and "5.0 GB" in lines["vggt-1b"]
+def test_models_and_describe_show_one_size_one_download_and_the_planned_memory(freegeo, monkeypatch):
+    monkeypatch.setattr(catalog, "names", lambda: ["da3-base", "vggt-1b", "freegeo-tiny"])
+    said = freegeo("models").out
+    lines = {line.split()[0]: line for line in said.splitlines() if line.strip()}  # of the last table with the name
+    needs = {item.entry.name: item for item in model_needs()}
+    assert list(needs) == catalog.names()
     assert "included" in lines["freegeo-tiny"]
-    memory = {name: reconstruction_bytes(catalog.build_empty(name)) for name in ("da3-base", "da3-giant")}
-    assert memory["da3-base"] < memory["da3-giant"]
-    for name, size in memory.items():
-        assert f"{size / 1e9:.1f} GB" in lines[name]
-
-
-def test_describe_says_how_much_memory_is_needed(freegeo):
-    out = freegeo("models", "describe", "depth-anything/DA3-BASE").out
-    assert out.startswith("da3-base: ")
-    built = catalog.build_empty("da3-base")
-    fast, small = adaptation_bytes(built)
-    assert reconstruction_bytes(built) > 4 * 135_366_599
-    assert fast > small > 4 * 135_366_599
-    assert f"to adapt on a GPU {fast / 1e9:.1f} GB, or {small / 1e9:.1f} GB where that does not fit" in out
+    for name in ("da3-base", "vggt-1b"):
+        found, out = needs[name], freegeo("models", "describe", name).out
+        assert out.startswith(f"{name}: ")
+        assert f"{found.parameters / 1e6:,.0f} M" in lines[name]
+        assert f"parameters: {found.parameters:,}\n" in out
+        assert found.download >= 4 * found.parameters
+        assert list(found.reconstruct) == [8, 32, 100]
+        assert 4 * found.parameters < found.reconstruct[8] < found.reconstruct[32] < found.reconstruct[100]
+        for size in (found.download, *found.reconstruct.values()):
+            assert f"{size / 1e9:.1f} GB" in lines[name] and f"{size / 1e9:.1f} GB" in out
+        fast, small = found.adapt
+        assert fast > small > 4 * found.parameters
+        assert f"memory to adapt to 8 of them: {fast / 1e9:.1f} GB, or {small / 1e9:.1f} GB" in out
 
 
 def test_describe_says_what_a_model_of_single_views_lacks(freegeo):
     out = freegeo("models", "describe", "da3metric-large").out
     assert "adapter: none, since it looks at each photo by itself" in out
-    assert "to adapt on a GPU" not in out
+    assert "memory to adapt" not in out
     assert "its depth is not in metres yet" in out
     assert "lengths: metres" in freegeo("models", "describe", "da3nested-giant-large").out
 

@@ -42,7 +42,7 @@ GIVEN = (
         recipe="paper", dataset="eth3d", views=6, keep="0,2,4", steps=7, epochs=2, sets=3, lr=1e-4, rank=8, hold=0.5,
         loss=("weight_kq=0", "selection=topk,angle_weights=2,2,2"),
     ),
-    PhotoOptions(max_views=9, fps=1.5, skip_bad=True, mixed="pad"),
+    PhotoOptions(max_views=9, fps=1.5, skip_bad=True, mixed="pad", process_res=756),
     PlacingOptions(one_camera=False, scale="a.jpg:812,410 b.jpg:655,398 = 1.25"),
     FileOptions(
         formats=("ply", "mesh"),

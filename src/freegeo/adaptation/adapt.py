@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,8 @@ in float32, more in half precision, and a run of three steps at a hundredth of t
 BLOWN_UP = 1e4
 """A loss of so many times the first step's ends a run: no run was seen to come back from there, and steps get slow."""
 CPU = Compute()
+OwnLoss = Callable[[Features, Features], Tensor]
+"""A term of the user's own: features of student and teacher for the views that the student sees -> one number."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +83,8 @@ class Adapted:
     precision: str = "fp32"
     with_cameras: bool = False
     """Whether the model was told known cameras."""
+    own_loss: str | None = None
+    """Name of the user's own term of the loss."""
     windows: tuple[int | None, ...] = ()
     """Of each scene, how many windows its view sets were drawn from; None: from all its images."""
 
@@ -106,6 +110,8 @@ class Adapted:
             "scenes": list(self.scenes),
             "precision": self.precision,
             "with_cameras": self.with_cameras,
+            "process_res": self.adapter.process_res,
+            "own_loss": self.own_loss,
             "windows": list(self.windows),
             "loss_curve": self.curve,
             # JSON has no infinity.
@@ -187,6 +193,7 @@ def adapt(
     on_step: Callable[[Progress], None] = lambda progress: None,
     on_epoch: Callable[[int, Adapter], None] = lambda epoch, adapter: None,
     keep_after: Sequence[float] = (),
+    own_loss: OwnLoss | None = None,
 ) -> Adapted:
     """Train an adapter on the scenes' images; afterwards it is attached to the model and on.
 
@@ -202,9 +209,11 @@ def adapt(
         on_step: called after every step.
         on_epoch: called after every epoch with its number and the adapter.
         keep_after: shares of the steps, between 0 and 1, after which the adapter's state is kept (`Adapted.earlier`).
+        own_loss: a term that is added to the loss of the student's views.
 
     Raises:
-        UserError: scenes that are too small, a state of another run, or a run that does not fit into memory.
+        UserError: scenes that are too small, a state of another run, a run that does not fit into memory, or a term of
+            the user's own that is not one number.
         DivergedError: a loss or gradient that is not finite, or a loss that has grown beyond recovery.
         FreeGeoError: memory that runs out even with the smallest plan.
     """
@@ -220,14 +229,14 @@ def adapt(
         logger.warning("%s", caution)
     plan = plan or plan_adaptation(model, scenes, recipe, visited(steps), compute=compute, folder=resume_in)
     wanted = {share: max(1, round(share * len(steps))) for share in keep_after}
-    run = _Run(model.adaptable(), scenes, recipe, steps, seed, compute, resume_in, on_step, on_epoch, wanted)
+    run = _Run(model.adaptable(), scenes, recipe, steps, seed, compute, resume_in, on_step, on_epoch, wanted, own_loss)
     try:
         return _train(run, plan)
     except torch.OutOfMemoryError:
         if plan.checkpointing and plan.place == "disk":
             raise FreeGeoError(
                 f"{compute.device} ran out of memory even with activation checkpointing and teacher features on disk. "
-                "Use smaller images, fewer --views, --precision bf16 or a smaller model."
+                "Use smaller images (--process-res), fewer --views, --precision bf16 or a smaller model."
             ) from None
     # Outside the except block the exception no longer keeps the tensors of the failed run alive.
     logger.warning(
@@ -236,7 +245,7 @@ def adapt(
     smallest = Plan(checkpointing=True, place="disk")
     return adapt(
         model, scenes, recipe, seed=seed, compute=compute, plan=smallest, resume_in=resume_in, on_step=on_step,
-        on_epoch=on_epoch, keep_after=keep_after,
+        on_epoch=on_epoch, keep_after=keep_after, own_loss=own_loss,
     )  # fmt: skip
 
 
@@ -299,6 +308,18 @@ class _Run:
     on_epoch: Callable[[int, Adapter], None]
     keep_after: Mapping[float, int]
     """Shares of the steps after which the adapter's state is kept -> how many finished steps that are."""
+    own_loss: OwnLoss | None
+
+
+def _name(own_loss: OwnLoss | None) -> str | None:
+    return None if own_loss is None else getattr(own_loss, "__qualname__", type(own_loss).__qualname__)
+
+
+def _process_res(run: _Run) -> int | None:
+    """Return the longest side of the images of a run; None for squares of the recipe's own, whatever is predicted."""
+    if run.recipe.squash is not None:
+        return None
+    return run.scenes[0].process_res or run.model.spec.default_side
 
 
 def _train(run: _Run, plan: Plan) -> Adapted:
@@ -307,11 +328,12 @@ def _train(run: _Run, plan: Plan) -> Adapted:
     model = run.model.to(run.compute.device)
     adapter = Adapter.attach(
         model, rank=recipe.rank, alpha=recipe.alpha, dropout=recipe.dropout,
-        generator=torch.Generator().manual_seed(run.seed),
+        generator=torch.Generator().manual_seed(run.seed), process_res=_process_res(run),
     )  # fmt: skip
     result = Adapted(
         adapter=adapter, recipe=recipe, seed=run.seed, scenes=tuple(scene.name for scene in run.scenes),
         precision=run.compute.precision, with_cameras=any(scene.priors is not None for scene in run.scenes),
+        own_loss=_name(run.own_loss),
         windows=tuple(None if scene.windows is None else len(scene.windows) for scene in run.scenes),
     )  # fmt: skip
     with ExitStack() as undo:
@@ -392,7 +414,22 @@ def _student_loss(run: _Run, adapter: Adapter, visit: Visit, sample: Sample) -> 
     if recipe.cameras:
         losses.append(recipe.cameras * _camera_loss(adapter.model, student, sample.student_targets()))
         terms["cameras"] = losses[-1].detach()
+    if run.own_loss is not None:
+        losses.append(_checked(run.own_loss(student, replace(student, levels=teacher))))
+        terms["own"] = losses[-1].detach()
     return torch.stack(losses).sum(), terms
+
+
+def _checked(term: object) -> Tensor:
+    """Return what a term of the user's own gave, as a number; UserError when it is none that can be learned from."""
+    if not isinstance(term, Tensor) or term.numel() != 1:
+        what = f"a tensor of {tuple(term.shape)}" if isinstance(term, Tensor) else type(term).__name__
+        raise UserError(f"own_loss must return a tensor with one number, the term's value; it returned {what}.")
+    if torch.is_grad_enabled() and not term.requires_grad:
+        raise UserError(
+            "own_loss returned a number that does not depend on the student's features, from which nothing is learned."
+        )
+    return term.reshape(()).float()
 
 
 def _all_views_loss(run: _Run, adapter: Adapter, sample: Sample) -> tuple[Tensor, dict[str, Tensor]]:
@@ -541,13 +578,15 @@ class _State:
     def _identity(self) -> str:
         """Return a fingerprint of model name, scenes, recipe, seed and precision; pixels and weights are left out.
 
-        Targets and priors of a scene are in it, which depend on more than the photos, and its windows.
+        Targets and priors of a scene are in it, which depend on more than the photos, its windows, and the size of its
+        images where that is not the model's default.
         """
         scenes = [
             (
                 scene.name,
                 scene.count,
                 *(part and part.digest() for part in (scene.targets, scene.priors)),
+                *(() if scene.process_res is None else (scene.process_res,)),
                 *(scene.windows or ()),
             )
             for scene in self.run.scenes
@@ -556,4 +595,6 @@ class _State:
         about = {"model": model, "scenes": scenes, "recipe": recipe, "seed": self.run.seed}
         about["precision"] = self.run.compute.precision
         about["keep_after"] = sorted(self.run.keep_after)
+        if self.run.own_loss is not None:
+            about["own_loss"] = _name(self.run.own_loss)
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]

@@ -72,8 +72,15 @@ class Adapter:
     A fresh one changes nothing: LoRA's B matrices are zero and the camera token is a copy.
     """
 
-    def __init__(self, model: ReconstructionModel, lora_config: LoraConfig, layers: dict[str, LoraLayer]):
+    def __init__(
+        self,
+        model: ReconstructionModel,
+        lora_config: LoraConfig,
+        layers: dict[str, LoraLayer],
+        process_res: int | None = None,
+    ):
         self.model = model
+        self.process_res = model.adapted_at = process_res
         self.lora_config = lora_config
         self.layers = layers
         self._base_token = _parameter(model, model.camera_token_name)
@@ -115,10 +122,12 @@ class Adapter:
         dropout: float,
         generator: torch.Generator,
         targets: Sequence[str] | None = None,
+        process_res: int | None = None,
     ) -> Adapter:
         """Put a fresh adapter on a model (all of `adapter_targets` unless `targets` are given).
 
-        A is drawn from U(+-1/sqrt(fan_in)) with `generator`. UserError when the model already has an adapter or a
+        A is drawn from U(+-1/sqrt(fan_in)) with `generator`. `process_res` is the longest side of the images that it is
+        trained on, where that is known. UserError when the model already has an adapter or a
         target is not one of its linear layers.
         """
         from peft import LoraConfig, inject_adapter_in_model
@@ -148,7 +157,7 @@ class Adapter:
             if dropout and on_cpu:
                 layer.lora_dropout[ADAPTER_NAME] = PackedDropout(dropout)
         config.target_modules = wanted
-        return cls(part, config, layers)
+        return cls(part, config, layers, process_res)
 
     def named_parameters(self) -> dict[str, nn.Parameter]:
         """Return everything that is trained, by name: `<module>.lora_A.weight`, `.lora_B.weight`, `camera_token`."""
@@ -260,6 +269,7 @@ class Adapter:
                 matrix.data = matrix.data.to(cast(nn.Linear, layer.base_layer).weight.device)
             self._put(name, cast(nn.Module, layer))
         self.model.peft_config = self._peft_config
+        self.model.adapted_at = self.process_res
         self._switch(True, self._flags())
 
     def _remove_layers(self) -> None:
@@ -267,6 +277,7 @@ class Adapter:
             self._put(name, layer.base_layer)
         # peft stores its configuration on the model; left there, it would cause a warning about a second adapter.
         del self.model.peft_config
+        self.model.adapted_at = None
 
     def _put(self, name: str, module: nn.Module) -> None:
         owner, _, leaf = name.rpartition(".")

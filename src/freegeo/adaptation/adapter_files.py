@@ -85,6 +85,7 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
         dropout=0.0,
         generator=torch.Generator(),
         targets=lora_layers(tensors),
+        process_res=(metadata or {}).get("process_res"),
     )
     ours = {name: tuple(value.shape) for name, value in adapter.named_parameters().items()}
     if "camera_token" not in tensors:
@@ -135,6 +136,7 @@ class Metadata(TypedDict, total=False):
     format: Required[int]
     base: Required[_Base]
     strength: float
+    process_res: int | None
 
 
 def adapter_metadata(folder: Path) -> dict[str, Any] | None:

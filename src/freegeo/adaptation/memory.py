@@ -99,8 +99,8 @@ def plan_adaptation(
             return plan
     raise UserError(
         f"adapting {model.spec.name} needs {plan.peak_bytes / 1e9:.1f} GB even with activation checkpointing (and "
-        f"{plan.kept_bytes / 1e9:.1f} GB of disk), and {budget / 1e9:.1f} GB are free. Use smaller images, fewer "
-        "--views, --precision bf16 or a smaller model."
+        f"{plan.kept_bytes / 1e9:.1f} GB of disk), and {budget / 1e9:.1f} GB are free. Use smaller images "
+        "(--process-res), fewer --views, --precision bf16 or a smaller model."
     )
 
 
@@ -359,7 +359,7 @@ def plan_reconstruction(
     fitting = next((count for count in range(fitting, 0, -1) if total(count) <= budget), 0)
     if total(views) > budget:
         advice = (
-            f"use at most {fitting} views (--max-views {fitting}) or smaller images"
+            f"use at most {fitting} views (--max-views {fitting}) or smaller images (--process-res)"
             if fitting
             else "use a smaller model or another device"
         )

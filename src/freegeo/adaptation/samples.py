@@ -38,6 +38,7 @@ from freegeo.adaptation.views import ViewSet, Visit, Windows
 from freegeo.errors import UserError
 from freegeo.files import scratch_folder
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
+from freegeo.models.images import read_some
 from freegeo.models.precision import Compute
 from freegeo.models.priors import usable_by_both
 from freegeo.types import Features, ImageBatch, PhotoLike, Priors, ViewTokens
@@ -75,6 +76,8 @@ class SceneImages:
     windows: Windows | None = None
     """Groups of images that show one part of a long sequence: each view set is drawn from one of them; None: from all
     images (`views.chunk_windows`)."""
+    process_res: int | None = None
+    """Longest side of the images that was asked for; None: the model's default, or a square of the recipe."""
 
     def __post_init__(self):
         for window in self.windows or ():
@@ -87,16 +90,22 @@ class SceneImages:
         inside = batch.inside()
         return cls(
             name=name, count=len(batch), load=lambda frames: batch.select(frames).read().images,
-            inside=None if inside.all() else inside,
+            inside=None if inside.all() else inside, process_res=batch.process_res,
         )  # fmt: skip
 
     @classmethod
     def from_photos(
-        cls, name: str, photos: Sequence[PhotoLike], model: ReconstructionModel, recipe: Recipe
+        cls,
+        name: str,
+        photos: Sequence[PhotoLike],
+        model: ReconstructionModel,
+        recipe: Recipe,
+        process_res: int | None = None,
     ) -> SceneImages:
         """Decode photos on demand, preprocessed by upstream's rule or squashed as the recipe says.
 
-        As upstream, the losses compare the padding that the preprocessing may add.
+        As upstream, the losses compare the padding that the preprocessing may add. `process_res` is the longest side of
+        images that are not squashed; None: the model's default.
 
         UserError when the recipe's square is no whole number of the model's patches.
         """
@@ -109,10 +118,12 @@ class SceneImages:
         def load(frames: Sequence[int]) -> Tensor:
             chosen = [photos[frame] for frame in frames]
             if recipe.squash is None:
-                return model.preprocess(chosen, mixed="upstream").images
+                return read_some(model, chosen, range(len(chosen)), "upstream", process_res).images
             return torch.cat([squashed(torch.from_numpy(photo.read()), recipe.squash) for photo in chosen])
 
-        return cls(name=name, count=len(photos), load=load)
+        return cls(
+            name=name, count=len(photos), load=load, process_res=None if recipe.squash is not None else process_res
+        )
 
 
 def squashed(pixels_HW3: Tensor, side: int) -> Tensor:

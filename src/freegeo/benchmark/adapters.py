@@ -49,7 +49,7 @@ class AdapterJob:
     recipe: Recipe
     seed: int
     base: Mapping[str, Any]
-    """Model, checkpoint and the precision of the adaptation."""
+    """Model, checkpoint, the precision of the adaptation, and the size of images where it is not the default."""
 
     def configuration(self) -> dict[str, Any]:
         """Everything that decides the adapter."""
@@ -184,7 +184,7 @@ def _usable_scenes(job: AdapterJob, model: ReconstructionModel, data: Path) -> t
             scene = load_scene(data, job.dataset, name)
             if len(scene) < SMALLEST_SCENE:
                 raise FreeGeoError(f"{len(scene)} frames are too few to adapt to; {SMALLEST_SCENE} are needed")
-            scenes.append(SceneImages.from_photos(name, scene.photos, model, job.recipe))
+            scenes.append(SceneImages.from_photos(name, scene.photos, model, job.recipe, job.base.get("process_res")))
         except DAMAGED as error:
             problems.append(
                 Problem(dataset=job.dataset, scene=name, stage="adapt", what="the scene", reason=reason_of(error))

@@ -42,6 +42,7 @@ from freegeo.files import write_json
 from freegeo.geometry.camera import resize_K
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import load_model
+from freegeo.models.images import chosen_side, read_some
 from freegeo.models.precision import Compute, Precision
 from freegeo.types import Features, ImageBatch, Prediction, Priors, ViewTokens
 
@@ -72,6 +73,8 @@ class Setup:
     """Which epoch's adapter predicts; None: the last."""
     given_cameras: bool = False
     """Give the model the true cameras; scored with them too (`recon_posed`)."""
+    process_res: int | None = None
+    """Longest side of the model's images; None: its default. Recipes that squash adapt at their own size."""
     scenes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Scenes of each dataset that a dataset-wise adapter is trained on."""
     overwrite: bool = False
@@ -92,6 +95,11 @@ class Predictor:
         """The model, loaded on first use."""
         model = load_model(self.setup.model, checkpoint=self.setup.checkpoint)
         return model.to(self.chosen.device).eval()
+
+    @property
+    def process_res(self) -> int | None:
+        """Longest side of the images where it is not the model's default; UserError for one that it cannot read."""
+        return chosen_side(self.model.spec, self.setup.process_res)
 
     @cached_property
     def compute(self) -> Compute:
@@ -169,8 +177,9 @@ class Predictor:
     def noise(self, views: int) -> Tensor:
         """Images (views, 3, H, W) of noise at the model's size, 4:3."""
         spec = self.model.spec
+        side = self.process_res or spec.default_side
         height, width = (max(1, round(side / spec.patch_size)) * spec.patch_size for side in (
-            spec.default_side * 3 / 4, spec.default_side,
+            side * 3 / 4, side,
         ))  # fmt: skip
         return torch.rand(views, 3, height, width, generator=torch.Generator().manual_seed(0))
 
@@ -217,7 +226,8 @@ class Predictor:
     def _read(self, scene: Scene, frames: Sequence[int]) -> tuple[ViewTokens, Priors | None]:
         """The embedded frames and, where the run gives the model the true cameras, these."""
         chosen = scene.select(frames)
-        batch = self.model.preprocess(list(chosen.photos), mixed="upstream")
+        photos = list(chosen.photos)
+        batch = read_some(self.model, photos, range(len(photos)), "upstream", self.process_res)
         tokens = self._embedded(batch.images)
         if not self.setup.given_cameras:
             return tokens, None
@@ -240,6 +250,7 @@ class Predictor:
             "checkpoint": loaded.fingerprint if loaded else None,
             "precision": self.compute.precision,
             **({"given_cameras": True} if self.setup.given_cameras else {}),
+            **({} if self.process_res is None else {"process_res": self.process_res}),
         }
 
     def _put_on(self, job: AdapterJob | None) -> None:

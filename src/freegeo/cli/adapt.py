@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
-from freegeo.cli.jobs import LABELS, check_inputs, check_place, say_finished
+from freegeo.cli.jobs import LABELS, check_inputs, check_place, say_finished, size_settings
 from freegeo.cli.options import CameraOptions, ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source, split_scenes
 from freegeo.progress import step_bar
@@ -57,7 +57,7 @@ def adapt(
     from freegeo.adaptation.adapt import require_unchanged_images
     from freegeo.data.photos import MAX_VIEWS
     from freegeo.errors import UserError
-    from freegeo.models.images import read_photos
+    from freegeo.models.images import chosen_side, read_photos
     from freegeo.pipeline import require_enough_photos, scene_images
     from freegeo.posed import check_known, told
     from freegeo.run_folder import run_folder
@@ -65,6 +65,7 @@ def adapt(
     check_place(output)
     empty = model.build_empty()
     empty.adaptable()
+    chosen_side(empty.spec, photos.process_res)
     plan = recipe.build(empty.spec)
     photos = replace(photos, max_views=MAX_VIEWS if photos.max_views is None else photos.max_views)
     scenes = {str(part[0]): load_source(part, photos) for part in split_scenes(sources)}
@@ -76,7 +77,10 @@ def adapt(
         raise UserError(f"--cameras is for one scene, and there are {len(scenes)}. Adapt to one, or leave it out.")
     name = next(iter(scenes))
     scenes[name], known = cameras.read(scenes[name])
-    batches = {name: read_photos(empty, found, mixed=photos.mixed) for name, found in scenes.items()}
+    batches = {
+        name: read_photos(empty, found, mixed=photos.mixed, process_res=photos.process_res)
+        for name, found in scenes.items()
+    }
     priors, sentence = told(known, batches[name], empty.spec)
     if sentence:
         console.note(sentence)
@@ -86,6 +90,7 @@ def adapt(
     settings = {
         "command": "adapt", "scenes": about, "published": published, "guard": guard, **model.identity(plan),
         "recipe": asdict(plan), **({} if priors is None else {"known_cameras": priors.digest()}),
+        **size_settings(batches[name]),
     }  # fmt: skip
     with run_folder(output.output, settings, overwrite=output.overwrite, labels=LABELS) as folder:
         if folder.finished:

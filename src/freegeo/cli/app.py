@@ -54,6 +54,7 @@ COMMANDS = {
     "view": ("freegeo.cli.view:view", "Look at results in the browser, before and after adaptation."),
     "bench": ("freegeo.cli.bench:app", "Published evaluation: datasets, tables, comparison with the paper."),
     "models": ("freegeo.cli.models:app", "List, describe, download and check models."),
+    "doctor": ("freegeo.cli.doctor:doctor", "Say what is installed, what is broken, and what to do next."),
     "train-tiny": ("freegeo.cli.train_tiny:train_tiny", "Train the embedded model on generated rooms."),
 }
 
@@ -152,14 +153,14 @@ def out_of_memory(error: BaseException) -> str | None:
     of_device = type(error).__name__ in ("OutOfMemoryError", "AcceleratorError") and "out of memory" in text
     if of_device or "MPS backend out of memory" in text:
         return (
-            "the memory of the device does not suffice. Use fewer photos (--max-views, --views), smaller images, "
-            f"--precision bf16 or a smaller --model, or free the device of other work. {again}"
+            "the memory of the device does not suffice. Use fewer photos (--max-views, --views), smaller images "
+            f"(--process-res), --precision bf16 or a smaller --model, or free the device of other work. {again}"
         )
     # PyTorch's allocator of main memory raises a plain RuntimeError.
     if isinstance(error, MemoryError) or "can't allocate memory" in text or "not enough memory" in text:
         return (
-            "the memory of this machine does not suffice. Use fewer photos (--max-views), smaller images or a smaller "
-            f"--model, or close other programs. {again}"
+            "the memory of this machine does not suffice. Use fewer photos (--max-views), smaller images "
+            f"(--process-res) or a smaller --model, or close other programs. {again}"
         )
     return None
 

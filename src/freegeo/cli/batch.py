@@ -120,6 +120,7 @@ def batch(
         'freegeo[cluster]'); every scene gets a GPU where the cluster has any, else a processor.
     """
     from freegeo.adaptation.adapter_files import find_adapter
+    from freegeo.models.images import chosen_side
 
     if jobs is not None and (jobs < 1 or cluster):
         raise UserError(
@@ -142,6 +143,7 @@ def batch(
     out = output.output.resolve()
     _check_output(out, named)
     empty = model.build_empty()
+    chosen_side(empty.spec, photos.process_res)
     adapting = adapt and adapter is None
     planned(empty, recipe if adapting else None, refine=refine, pose_from=pose_from, placing=placing)
     found = _look_at_all(named, photos, files, adapting=adapting, has_cameras=empty.spec.cameras)

@@ -98,6 +98,9 @@ class PredictOptions:
     """One adapter for all scenes of a dataset, or one for each."""
     epoch: int | None = None
     """Epoch whose adapter is used, counted from 0; default: the last."""
+    process_res: int | None = None
+    """Longest side of the model's images, in the adaptation (but for recipes that squash) and in predictions. The
+    published tables are those of the default, 504."""
     given_cameras: bool = False
     """Give the model the true cameras and fuse its depth with them (recon_posed)."""
     overwrite: bool = False
@@ -535,7 +538,7 @@ def _prepare(
             data=bench.data, out=bench.output, model=model.name, checkpoint=model.checkpoint, device=model.device,
             precision=model.precision, recipe=recipe.recipe, changes=changes, adapt_per=options.adapt_per,
             adapt_seed=model.seed, epoch=options.epoch, given_cameras=options.given_cameras, scenes=scenes,
-            overwrite=options.overwrite,
+            process_res=options.process_res, overwrite=options.overwrite,
         )
     )  # fmt: skip
     use_few_threads(predictor.model)

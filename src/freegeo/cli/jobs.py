@@ -52,7 +52,7 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_FILES = FileOptions()
 NO_CAMERAS, DEFAULT_PLACING, DEFAULT_SEQUENCE = CameraOptions(), PlacingOptions(), SequenceOptions()
-_OTHER_CONTENTS = "photos with other contents"
+_OTHER_CONTENTS = "photos with other contents, or read at another size"
 LABELS = {
     "photos": "other photos", "photo_contents": _OTHER_CONTENTS, "contents": _OTHER_CONTENTS, "scenes": "other scenes",
     "checkpoint": "other weights", "weights": "another adapter", "folder": "--adapter", "masks": "other masks",
@@ -73,6 +73,7 @@ LABELS = {
         )
     },
     "pose_from": "--pose-from",
+    "process_res": "--process-res",
     "chunk": "--chunk", "overlap": "--overlap", "order": "--order", "loops": "--loops",
     "judged_by": "the predictions that the guard judges by",
 }  # fmt: skip
@@ -112,6 +113,7 @@ def run_job(
     recipe: RecipeOptions | None,
     adapter: Path | None = None,
     mixed: Mixed = MIXED,
+    process_res: int | None = None,
     files: FileOptions = DEFAULT_FILES,
     guard: Guard = "select",
     refine: Refine = "off",
@@ -131,12 +133,14 @@ def run_job(
     from freegeo.cameras.undistortion import UndistortedPhoto
     from freegeo.data.video import VideoFrame
     from freegeo.job import MATCHES_NAME, PARTS, SUMMARY_NAME, Job
+    from freegeo.models.images import chosen_side
     from freegeo.pipeline import require_enough_photos
     from freegeo.sequence_job import SEQUENCE_PARTS, SequenceJob
 
     check_place(output)
     check_inputs(output, photos, adapter, cameras.cameras)
     empty = model_options.build_empty()
+    process_res = chosen_side(empty.spec, process_res)
     formats = files.all_formats(output, photos, has_cameras=empty.spec.cameras)
     plan, refining = planned(empty, recipe, refine=refine, pose_from=pose_from, cameras=cameras, placing=placing)
     if plan is not None:
@@ -144,8 +148,8 @@ def run_job(
     if empty.spec.caution:
         logger.warning("%s", empty.spec.caution)
     found = _read_inputs(
-        photos, empty, model_options, plan, mixed=mixed, files=files, cameras=cameras, placing=placing,
-        sequence=sequence, before=None if output.overwrite else _together_before(output.output),
+        photos, empty, model_options, plan, mixed=mixed, process_res=process_res, files=files, cameras=cameras,
+        placing=placing, sequence=sequence, before=None if output.overwrite else _together_before(output.output),
     )  # fmt: skip
     settings = {
         "command": command,
@@ -212,6 +216,7 @@ def _read_inputs(
     plan: Recipe | None,
     *,
     mixed: Mixed,
+    process_res: int | None,
     files: FileOptions,
     cameras: CameraOptions,
     placing: PlacingOptions,
@@ -232,12 +237,14 @@ def _read_inputs(
     masks = files.checked_masks(photos)
     photos, known = cameras.read(photos)
     masks = undistorted_masks(masks, photos)
-    chunks = sequence.plan(empty, photos, mixed, model_options.compute(), before=before)
+    chunks = sequence.plan(
+        empty, photos, mixed, model_options.compute(), process_res=process_res, before=before
+    )  # fmt: skip
     if chunks is None:
-        batch: ImageBatch = read_photos(empty, photos, mixed=mixed)
+        batch: ImageBatch = read_photos(empty, photos, mixed=mixed, process_res=process_res)
     else:
         _require_joinable(chunks, known, plan)
-        frames = look_at_photos(empty, photos, mixed=mixed)
+        frames = look_at_photos(empty, photos, mixed=mixed, process_res=process_res)
         shown = _shown(frames)
         batch, photos = frames.select(shown), [photos[view] for view in shown]
         known = None if known is None else known.select(shown)
@@ -281,6 +288,7 @@ def _asked_of_model(
         "guard": None if plan is None else guard,
         "adapter": None if adapter is None else adapter_identity(adapter),
         **({} if found.priors is None else {"known_cameras": found.priors.digest()}),
+        **size_settings(found.batch),
     }  # fmt: skip
     # Only where it is not the default, so that folders of earlier versions count as finished.
     rays = {} if pose_from == "camera" else {"pose_from": pose_from}
@@ -367,6 +375,11 @@ def planned(
             f"recipe {plan.name} teaches the camera head, which --pose-from rays does not read. Leave out one of them."
         )
     return plan, refining
+
+
+def size_settings(batch: ImageBatch) -> dict[str, int]:
+    """Return the part of settings about the size of images; empty for the model's default."""
+    return {} if batch.process_res is None else {"process_res": batch.process_res}
 
 
 def placing_settings(

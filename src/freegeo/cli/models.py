@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
 from freegeo.cli import console
-from freegeo.errors import FreeGeoError
 from freegeo.models import catalog
 from freegeo.progress import progress_bar
 
 if TYPE_CHECKING:
-    from freegeo.models.api import ReconstructionModel
+    from freegeo.adaptation.needs import ModelNeeds
     from freegeo.models.spec import ModelEntry
 
-logger = logging.getLogger(__name__)
 app = App(name="models", help="List, describe, download and check models.", help_format="plaintext")
 TABLE_WIDTH = 100
 RANKS = (8, 16, 32, 64)
-VIEWS = 8
 TAKES = {
     "nothing": "photos alone; known cameras are used afterwards",
     "cameras": "photos, and the poses together with the intrinsics of all of them",
@@ -32,70 +28,38 @@ TAKES = {
 @app.default
 def list_models() -> None:
     """List all models that can be used."""
-    header = ("model", "licence", "download", "memory", "about")
-    rows = []
-    for name in catalog.names():
-        try:
-            rows.append(_row(name))
-        except Exception as error:
-            told = catalog.broken(name, error)
-            if not isinstance(told, FreeGeoError):
-                raise
-            logger.warning("%s", told)
-    console.say(console.table(header, rows, prose=TABLE_WIDTH))
-    console.say("\nLicences are those of the weights; memory is what reconstructing 8 photos takes.")
-    console.say("`freegeo models describe NAME` says more about one model.")
+    from freegeo.adaptation.needs import VIEWS, model_needs
+
+    found = model_needs()
+    about = [(needs.entry.name, _about(needs.entry)) for needs in found]
+    console.say(console.table(("model", "about"), about, prose=TABLE_WIDTH))
+    header = ("model", "parameters", "licence", "download", *(f"{views} views" for views in VIEWS))
+    console.say("\n" + console.table(header, map(_row, found)))
+    console.say("\nLicences are those of the weights. Views: memory for reconstructing so many photos of 4:3 at once,")
+    console.say("on a GPU in bf16, by the planner; a CPU takes the same for 8 and up to a sixth more for 100.")
+    console.say("`freegeo models describe NAME` says more about one model, and what adapting takes.")
 
 
-def _row(name: str) -> tuple[str, str, str, str, str]:
-    item = catalog.entry(name)
-    # Details follow after a bracket in licences and after a semicolon in descriptions.
-    licence, about = item.licence.partition(" (")[0], item.about.partition(";")[0]
-    return name, licence, _download(item), _gigabytes(reconstruction_bytes(catalog.build_empty(name))), about
+# Details follow after a semicolon in descriptions and after a bracket in licences.
+def _about(item: ModelEntry) -> str:
+    return item.about.partition(";")[0]
 
 
-def _download(item: ModelEntry) -> str:
-    if item.hub_id is not None:
-        return _gigabytes(item.download_bytes)
-    return "included" if item.packaged_weights else "none"
+def _row(needs: ModelNeeds) -> tuple[str, ...]:
+    licence = needs.entry.licence.partition(" (")[0]
+    memory = map(gigabytes, needs.reconstruct.values())
+    return needs.entry.name, f"{needs.parameters / 1e6:,.0f} M", licence, _download(needs), *memory
 
 
-def _gigabytes(size: float) -> str:
+def _download(needs: ModelNeeds) -> str:
+    if needs.download is not None:
+        return gigabytes(needs.download)
+    return "included" if needs.entry.packaged_weights else "none"
+
+
+def gigabytes(size: float) -> str:
+    """Return a number of bytes as text for a table."""
     return f"{size / 1e9:.1f} GB" if size >= 5e7 else "< 0.1 GB"
-
-
-def reconstruction_bytes(model: ReconstructionModel) -> int:
-    """Predict the memory that 8 photos of 4:3 need together."""
-    from freegeo.adaptation.memory import plan_reconstruction
-    from freegeo.models.precision import Compute
-
-    # A budget that no result exceeds; the planner takes long for one that is far larger.
-    budget = 1000 * sum(parameter.numel() for parameter in model.parameters())
-    parts, _ = plan_reconstruction(model, VIEWS, image_hw(model), compute=Compute(), budget=budget)
-    return sum(size for _, size in parts)
-
-
-def adaptation_bytes(model: ReconstructionModel) -> tuple[int, int]:
-    """Predict the memory of adapting to 8 photos of 4:3 in bf16 on a GPU: as fast as possible, and as small."""
-    import torch
-
-    from freegeo.adaptation.memory import Footprint
-    from freegeo.adaptation.recipe import SEED, scene
-    from freegeo.adaptation.samples import SceneImages
-    from freegeo.adaptation.views import schedule
-    from freegeo.models.precision import Compute
-
-    recipe, (height, width) = scene(model.spec), image_hw(model)
-    photos = SceneImages(name="photos", count=VIEWS, load=lambda frames: torch.empty(len(frames), 3, height, width))
-    compute = Compute(device=torch.device("cuda"), precision="bf16")
-    job = Footprint(model, [photos], recipe, schedule([VIEWS], recipe, SEED), compute)
-    return job.plan("device", checkpointing=False).peak_bytes, job.plan("disk", checkpointing=True).peak_bytes
-
-
-def image_hw(model: ReconstructionModel) -> tuple[int, int]:
-    """Return the size of a 4:3 photo after preprocessing."""
-    side, patch = model.spec.default_side, model.spec.patch_size
-    return round(side * 3 / 4 / patch) * patch, side
 
 
 @app.command
@@ -108,24 +72,24 @@ def describe(model: str) -> None:
         Name or hub id of a model.
     """
     from freegeo.adaptation.adapter import count_trainable
+    from freegeo.adaptation.needs import ADAPTED_VIEWS, needs_of
 
-    item = catalog.entry(model)
-    built = catalog.build_empty(model)
-    spec, (height, width) = built.spec, image_hw(built)
+    needs = needs_of(model)
+    item, built, (height, width) = needs.entry, catalog.build_empty(model), needs.image_hw
+    spec = built.spec
     console.say(f"{item.name}: {item.about}")
     console.say(f"licence of the weights: {item.licence}")
     source = f"{item.hub_id}, {item.hub_file}" if item.hub_id else item.packaged_weights or "local file (--checkpoint)"
     console.say(f"weights: {source}")
-    console.say(f"parameters: {sum(parameter.numel() for parameter in built.parameters()):,}")
+    console.say(f"parameters: {needs.parameters:,}")
+    console.say(f"download: {_download(needs)}")
     if item.hub_id:
-        console.say(f"download: {_gigabytes(item.download_bytes)}")
         _say_pins(item)
-    needed = _gigabytes(reconstruction_bytes(built))
-    memory = f"memory for {VIEWS} photos of 4:3 ({width} x {height}): {needed} to reconstruct"
-    if built.cross_view is not None:
-        fast, small = adaptation_bytes(built)
-        memory += f"; to adapt on a GPU {_gigabytes(fast)}, or {_gigabytes(small)} where that does not fit"
-    console.say(memory)
+    memory = ", ".join(f"{gigabytes(size)} for {views}" for views, size in needs.reconstruct.items())
+    console.say(f"memory to reconstruct photos of 4:3 ({width} x {height}), on a GPU in bf16 by the planner: {memory}")
+    if needs.adapt is not None:
+        fast, small = map(gigabytes, needs.adapt)
+        console.say(f"memory to adapt to {ADAPTED_VIEWS} of them: {fast}, or {small} where that does not fit")
     console.say(f"images: longest side {spec.default_side}, patches of {spec.patch_size}")
     console.say(f"lengths: {'metres' if spec.metric else 'up to scale'}")
     console.say(f"takes: {TAKES[spec.takes]}")

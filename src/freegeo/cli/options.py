@@ -278,6 +278,9 @@ class PhotoOptions:
     """Leave out photos that cannot be read, with a warning, instead of stopping."""
     mixed: Mixed = MIXED
     """Photos of different shapes: cut the odd ones, pad all with white (nothing is lost), or do as upstream does."""
+    process_res: int | None = None
+    """Longest side in pixels of what the model sees, rounded to its patches: more shows more detail and takes more
+    memory and time. Default: the model's own (`freegeo models describe`); 504 for the published ones."""
 
 
 @Parameter(name="*")
@@ -345,6 +348,7 @@ class SequenceOptions:
         mixed: Mixed,
         compute: Compute,
         *,
+        process_res: int | None = None,
         before: int | None = None,
     ) -> Plan | None:
         """Return how photos are cut into chunks; None where all are predicted at once.
@@ -357,7 +361,7 @@ class SequenceOptions:
         from freegeo.sequence.chunks import OVERLAP, plan_chunks
         from freegeo.sequence_job import Plan
 
-        count, image_hw = len(photos), read_some(model, photos, [0], mixed).image_hw
+        count, image_hw = len(photos), read_some(model, photos, [0], mixed, process_res).image_hw
         _, fitting = plan_reconstruction(model, 1, image_hw, compute=compute)
         size = (before or min(fitting, model.spec.chunk)) if self.chunk == "auto" else self._size()
         if min(size, count) > fitting:

@@ -60,6 +60,7 @@ def reconstruct(
     found = load_source(sources, photos)
     model.warn_of_embedded(sources)
     run_job(
-        found, model, output, command="reconstruct", recipe=None, adapter=adapter, mixed=photos.mixed, files=files,
+        found, model, output, command="reconstruct", recipe=None, adapter=adapter, mixed=photos.mixed,
+        process_res=photos.process_res, files=files,
         refine=refine, pose_from=pose_from, cameras=cameras, placing=placing, sequence=sequence,
     )  # fmt: skip

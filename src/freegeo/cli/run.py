@@ -62,6 +62,7 @@ def run(
     model.warn_of_embedded(sources)
     plan = recipe if adapt else None
     run_job(
-        found, model, output, command="run", recipe=plan, mixed=photos.mixed, files=files, guard=guard, refine=refine,
+        found, model, output, command="run", recipe=plan, mixed=photos.mixed,
+        process_res=photos.process_res, files=files, guard=guard, refine=refine,
         pose_from=pose_from, cameras=cameras, placing=placing, sequence=sequence,
     )  # fmt: skip

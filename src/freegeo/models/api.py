@@ -30,14 +30,23 @@ class ReconstructionModel(nn.Module, ABC):
     published_adapter_root: str = ""
     """Module that adapter files of the method's authors name layers relative to; empty: the model itself."""
 
+    adapted_at: int | None = None
+    """Longest side of the images that the adapter in place was trained on; None: unknown, or no adapter."""
+
     feature_copies: int = 1
     """Copies of all features that `aggregate` makes, such as normalised ones; the memory planner counts them."""
     feature_channels: int | None = None
     """Channels of the features at `spec.loss_layers`; None: twice the width, where two blocks' outputs are joined."""
 
     @abstractmethod
-    def preprocess(self, photos: Sequence[PhotoLike], *, mixed: Mixed = MIXED) -> ImageBatch:
-        """Resize photos as the model was trained, to one size by the rule `mixed`; UserError for an unusable photo."""
+    def preprocess(
+        self, photos: Sequence[PhotoLike], *, mixed: Mixed = MIXED, process_res: int | None = None
+    ) -> ImageBatch:
+        """Resize photos as the model was trained, to one size by the rule `mixed`; UserError for an unusable photo.
+
+        `process_res` is the longest side that is asked for, None the model's default; it is given only where
+        `spec.sides` is not None.
+        """
 
     @abstractmethod
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:

@@ -187,9 +187,9 @@ class DA3Images(ReconstructionModel):
     def _vit(self) -> Backbone:
         return cast(Backbone, self.backbone["pretrained"])
 
-    def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED) -> ImageBatch:
-        """Resize to the default longest side, then to the nearest multiples of the patch."""
-        side, patch = self.spec.default_side, self.config.patch_size
+    def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED, process_res: int | None = None) -> ImageBatch:
+        """Resize to the longest side, by default 504, then to the nearest multiples of the patch."""
+        side, patch = process_res or self.spec.default_side, self.config.patch_size
         return da3_images.preprocess(photos, side=side, patch=patch, mixed=mixed)
 
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:

@@ -131,9 +131,9 @@ class DA3Nested(ReconstructionModel):
         """Turn per-block activation checkpointing of the any-view part on or off."""
         self.da3.set_recompute(recompute)
 
-    def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED) -> ImageBatch:
+    def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED, process_res: int | None = None) -> ImageBatch:
         """Resize as the any-view part does."""
-        return self.da3.preprocess(photos, mixed=mixed)
+        return self.da3.preprocess(photos, mixed=mixed, process_res=process_res)
 
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:
         """Embed for the any-view part, and predict metric depth and sky; the latter only if `layers` is None."""

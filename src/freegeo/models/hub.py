@@ -108,6 +108,26 @@ def local_file(item: ModelEntry) -> tuple[str, str] | None:
     return None if kept is None else (_revision(kept, item), sha256_of(kept))
 
 
+def cache_folder() -> Path:
+    """Return the folder of the hub's cache."""
+    from huggingface_hub import constants
+
+    return Path(constants.HF_HUB_CACHE)
+
+
+def cached_file(item: ModelEntry) -> tuple[Path, int, bool] | None:
+    """Return path and size of a model's file in the cache, and whether it is complete; None when nothing is there.
+
+    Of a download that was interrupted, what has arrived so far.
+    """
+    kept = _kept(item)
+    if kept is not None and kept.is_file():
+        return kept, kept.stat().st_size, _has_its_length(kept)
+    begun = [part for part in _folder(item).glob("blobs/*.incomplete") if part.stat().st_size]
+    newest = max(begun, key=lambda part: part.stat().st_mtime_ns, default=None)
+    return None if newest is None else (newest, newest.stat().st_size, False)
+
+
 def is_verified(path: Path, expected: str | None, *, check_hash: bool) -> bool:
     """Whether a checkpoint is as long as it says and has the SHA-256 that is expected, or any where none is known.
 
@@ -164,9 +184,7 @@ def _gone(item: ModelEntry) -> Path | None:
 
 def _folder(item: ModelEntry) -> Path:
     """Return the folder of a model's repository in the cache of the hub."""
-    from huggingface_hub import constants
-
-    return Path(constants.HF_HUB_CACHE, f"models--{(item.hub_id or '').replace('/', '--')}")
+    return Path(cache_folder(), f"models--{(item.hub_id or '').replace('/', '--')}")
 
 
 def _revision(kept: Path, item: ModelEntry) -> str:
@@ -305,10 +323,11 @@ def _licence_first(item: HubFile) -> str:
 def _settings(*names: str) -> str:
     """Return the environment variables among `names` that are set, in either case, without passwords."""
     found = [(name, value) for name, value in sorted(os.environ.items()) if name.upper() in names and value]
-    return " and ".join(f"{name}={_without_password(value)}" for name, value in found)
+    return " and ".join(f"{name}={without_password(value)}" for name, value in found)
 
 
-def _without_password(address: str) -> str:
+def without_password(address: str) -> str:
+    """Return an address without the name and password in it."""
     return _PASSWORD.sub(r"\1", address)
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from freegeo.data.image_files import is_blank
 from freegeo.errors import UserError
 from freegeo.geometry.resample import resize_area, resize_cubic
-from freegeo.models.spec import MIXED, Mixed
+from freegeo.models.spec import MIXED, Mixed, ModelSpec
 from freegeo.types import ImageBatch, PhotoLike
 
 if TYPE_CHECKING:
@@ -38,31 +38,45 @@ ONE_SHAPE = 0.02
 """Largest relative difference of aspects that counts as one shape."""
 ENLARGED_WORTH_A_WARNING = 2.0
 """Factor up to which photos may be enlarged without a word."""
+SIDE_FACTOR = 4
+"""Largest factor between the default longest side of a model and one that is asked for."""
 
 
-def read_photos(model: ReconstructionModel, photos: Sequence[PhotoLike], *, mixed: Mixed = MIXED) -> ImageBatch:
+def read_photos(
+    model: ReconstructionModel, photos: Sequence[PhotoLike], *, mixed: Mixed = MIXED, process_res: int | None = None
+) -> ImageBatch:
     """Preprocess photos for a model, and warn where the model sees much less than they show.
 
+    Args:
+        model: whose rule it is.
+        photos: the photos.
+        mixed: how photos of different shapes get one size.
+        process_res: longest side that is asked for; None: the model's default.
+
     Raises:
-        UserError: an unknown rule `mixed`, or a photo that cannot be used.
+        UserError: an unknown rule `mixed`, a `process_res` that the model cannot read, or a photo that cannot be used.
     """
+    process_res = chosen_side(model.spec, process_res)
     if mixed not in get_args(Mixed):
         raise UserError(f"mixed is one of {', '.join(get_args(Mixed))}, not {mixed!r}.")
-    batch = model.preprocess(photos, mixed=mixed)
-    _warn(batch, mixed)
+    batch = _preprocessed(model, photos, mixed, process_res)
+    _warn(batch, mixed, model.spec)
     return batch
 
 
-def look_at_photos(model: ReconstructionModel, photos: Sequence[PhotoLike], *, mixed: Mixed = MIXED) -> Frames:
+def look_at_photos(
+    model: ReconstructionModel, photos: Sequence[PhotoLike], *, mixed: Mixed = MIXED, process_res: int | None = None
+) -> Frames:
     """Read each of many photos once, a few at a time, and warn as `read_photos`; their pixels are read again later.
 
-    Errors as `read_photos`.
+    Arguments and errors as `read_photos`.
     """
+    process_res = chosen_side(model.spec, process_res)
     if mixed not in get_args(Mixed):
         raise UserError(f"mixed is one of {', '.join(get_args(Mixed))}, not {mixed!r}.")
     contents, looks, blank = hashlib.sha256(), [], []
     for start in range(0, len(photos), _AT_A_TIME):
-        batch = read_some(model, photos, range(start, min(start + _AT_A_TIME, len(photos))), mixed)
+        batch = read_some(model, photos, range(start, min(start + _AT_A_TIME, len(photos))), mixed, process_res)
         contents.update(batch.digest().encode())
         pixels = (batch.images * 255).byte().permute(0, 2, 3, 1).numpy()
         blank += [start + row for row, image in enumerate(pixels) if is_blank(image)]
@@ -72,10 +86,28 @@ def look_at_photos(model: ReconstructionModel, photos: Sequence[PhotoLike], *, m
     frames = Frames(
         images=torch.zeros(()).expand(len(photos), *shape), names=tuple(photo.name for photo in photos), **geometry,
         contents=contents.hexdigest(), photos=tuple(photos), chosen=tuple(range(len(photos))),
-        blank=frozenset(blank), model=model, mixed=mixed,
+        blank=frozenset(blank), model=model, mixed=mixed, process_res=process_res,
     )  # fmt: skip
-    _warn(frames, mixed)
+    _warn(frames, mixed, model.spec)
     return frames
+
+
+def chosen_side(spec: ModelSpec, process_res: int | None) -> int | None:
+    """Return the longest side that a model is asked for, None where it is its default.
+
+    UserError for a side that the model cannot read.
+    """
+    if process_res is None or process_res == spec.default_side:
+        return None
+    if spec.sides is None:
+        raise UserError(f"{spec.name} reads photos at {spec.default_side} pixels only. Leave --process-res out.")
+    least, most = spec.default_side // SIDE_FACTOR, spec.default_side * SIDE_FACTOR
+    if not least <= process_res <= most:
+        raise UserError(
+            f"--process-res {process_res}: {spec.name} reads photos with a longest side of {least} to {most} pixels, "
+            f"rounded to patches of {spec.patch_size}; its default is {spec.default_side}."
+        )
+    return process_res
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +140,7 @@ class Frames(ImageBatch):
 
     def read(self) -> ImageBatch:
         """Read the pixels: each view as it would be beside all photos."""
-        return read_some(self.model, self.photos, self.chosen, self.mixed)
+        return read_some(self.model, self.photos, self.chosen, self.mixed, self.process_res)
 
     def digest(self) -> str:
         """Return a fingerprint of the pixels."""
@@ -128,26 +160,54 @@ class SizeOnly:
 
 
 def read_some(
-    model: ReconstructionModel, photos: Sequence[PhotoLike], chosen: Sequence[int], mixed: Mixed
+    model: ReconstructionModel,
+    photos: Sequence[PhotoLike],
+    chosen: Sequence[int],
+    mixed: Mixed,
+    process_res: int | None = None,
 ) -> ImageBatch:
     """Preprocess the chosen ones of photos to the size that all of them have together."""
     if len({photo.size_hw for photo in photos}) == 1:
-        return model.preprocess([photos[number] for number in chosen], mixed=mixed)
+        return _preprocessed(model, [photos[number] for number in chosen], mixed, process_res)
     # In the order of all photos, since the first one may decide.
     wanted = sorted(set(chosen))
     every = [
         photo if number in wanted else SizeOnly(name=photo.name, size_hw=photo.size_hw)
         for number, photo in enumerate(photos)
     ]
-    batch = model.preprocess(every, mixed=mixed)
+    batch = _preprocessed(model, every, mixed, process_res)
     is_whole = len(batch) == len(photos)
     return batch.select([number if is_whole else wanted.index(number) for number in chosen])
 
 
-def _warn(batch: ImageBatch, mixed: Mixed) -> None:
-    for sentence in (_cut_sentence(batch, mixed), _enlarged_sentence(batch)):
+def _preprocessed(
+    model: ReconstructionModel, photos: Sequence[PhotoLike], mixed: Mixed, process_res: int | None
+) -> ImageBatch:
+    # A plug-in that has one size only need not know of others.
+    if process_res is None:
+        return model.preprocess(photos, mixed=mixed)
+    return replace(model.preprocess(photos, mixed=mixed, process_res=process_res), process_res=process_res)
+
+
+def _warn(batch: ImageBatch, mixed: Mixed, spec: ModelSpec) -> None:
+    if batch.process_res is not None and batch.process_res % spec.patch_size:
+        logger.info(
+            "--process-res %d is rounded to patches of %d: images are %d x %d.",
+            batch.process_res, spec.patch_size, *batch.image_hw[::-1],
+        )  # fmt: skip
+    for sentence in (_side_sentence(batch, spec), _cut_sentence(batch, mixed), _enlarged_sentence(batch)):
         if sentence:
             logger.warning(sentence)
+
+
+def _side_sentence(batch: ImageBatch, spec: ModelSpec) -> str | None:
+    """Say that a size is far from what the model is used to."""
+    if batch.process_res is None or spec.sides is None or spec.sides[0] <= batch.process_res <= spec.sides[1]:
+        return None
+    return (
+        f"{spec.name} reads photos at {spec.default_side} pixels by default, and {batch.process_res} is far from that: "
+        f"compare with a result of --process-res {spec.sides[0]} to {spec.sides[1]} before you trust this one."
+    )
 
 
 def _cut_sentence(batch: ImageBatch, mixed: Mixed) -> str | None:
@@ -189,7 +249,7 @@ def _enlarged_sentence(batch: ImageBatch) -> str | None:
     which = least if len(views) == 1 else f"{len(views)} of {len(batch)} photos (the smallest is {least})"
     return (
         f"{which} must be enlarged up to {float(factor.max()):.1f} times for the model, which adds no detail; use the "
-        "originals if these are previews."
+        f"originals if these are previews{'' if batch.process_res is None else ', or a smaller --process-res'}."
     )
 
 

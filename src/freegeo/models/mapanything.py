@@ -251,9 +251,9 @@ class MapAnything(ReconstructionModel):
             for name in block_linears(f"info_sharing.self_attention_blocks.{i}", block)
         ]
 
-    def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED) -> ImageBatch:
+    def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED, process_res: int | None = None) -> ImageBatch:
         """Cover one of ten sizes, and cut around the middle."""
-        side, patch = self.spec.default_side, self.config.patch_size
+        side, patch = process_res or self.spec.default_side, self.config.patch_size
         return mapanything_images.preprocess(photos, side=side, patch=patch, mixed=mixed)
 
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:

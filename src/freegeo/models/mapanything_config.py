@@ -79,6 +79,7 @@ def spec_of(name: str, config: MapAnythingConfig, licence: str, side: int) -> Mo
         name=name,
         patch_size=config.patch_size,
         default_side=side,
+        sides=(side // 2, side * 2),
         loss_layers=config.out_layers,
         reference="first",
         special_tokens=1,

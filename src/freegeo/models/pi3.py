@@ -170,10 +170,14 @@ class Pi3(ReconstructionModel):
         """Return all linears of the blocks within and across views."""
         return [name for i, block in enumerate(self.decoder) for name in block_linears(f"decoder.{i}", block)]
 
-    def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED) -> ImageBatch:
-        """Resize to the number of pixels that the model was trained with, the aspect kept up to whole patches."""
-        config = self.config
-        return pi3_images.preprocess(photos, patch=config.patch_size, pixels=config.pixels, mixed=mixed)
+    def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED, process_res: int | None = None) -> ImageBatch:
+        """Resize to the number of pixels that the model was trained with, the aspect kept up to whole patches.
+
+        Another side asks for the number of pixels that a 4:3 photo of that side has.
+        """
+        config, factor = self.config, (process_res or self.spec.default_side) / self.spec.default_side
+        pixels = round(config.pixels * factor**2)
+        return pi3_images.preprocess(photos, patch=config.patch_size, pixels=pixels, mixed=mixed)
 
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:
         """Run the patch encoder on images (B, S, 3, H, W) in [0, 1]; `layers` changes nothing."""

@@ -14,6 +14,8 @@ from freegeo.models.spec import NO_REFERENCE, AdaptationDefaults, KeyRules, Mode
 if TYPE_CHECKING:
     from freegeo.models.pi3 import Pi3
 
+DEFAULT_SIDE = 574
+"""Longest side of a 4:3 photo; what is fixed is the number of pixels, whatever the shape."""
 NON_COMMERCIAL = "CC BY-NC 4.0 (non-commercial)"
 
 
@@ -106,7 +108,8 @@ def _entry(name: str, about: str, config: Pi3Config, hub_id: str, parameters: in
     spec = ModelSpec(
         name=name,
         patch_size=config.patch_size,
-        default_side=574,
+        default_side=DEFAULT_SIDE,
+        sides=(287, DEFAULT_SIDE),
         loss_layers=(config.readout,),
         reference=NO_REFERENCE,
         special_tokens=config.registers,

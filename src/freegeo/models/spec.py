@@ -55,7 +55,7 @@ class ModelSpec:
     name: str
     patch_size: int
     default_side: int
-    """Longest image side after `preprocess`, in pixels."""
+    """Longest image side after `preprocess`, in pixels, unless another one is asked for."""
     loss_layers: tuple[int, ...]
     """Layers whose features the losses compare, ascending; the last one carries the relational loss."""
     reference: str
@@ -76,6 +76,8 @@ class ModelSpec:
     """Views that are predicted together unless more are asked for: longer sequences are cut into chunks."""
     takes: Takes = "nothing"
     """What the model can be told of its views (`freegeo.types.Priors`)."""
+    sides: tuple[int, int] | None = None
+    """Smallest and largest side that `preprocess` can be asked for without a warning; None: it has its default only."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -166,9 +166,9 @@ class VGGT(ReconstructionModel):
             for name in block_linears(f"aggregator.{kind}.{i}", block)
         ]
 
-    def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED) -> ImageBatch:
-        """Resize to the default longest side, the aspect kept up to whole patches, as in the benchmark."""
-        side, patch = self.spec.default_side, self.config.patch_size
+    def preprocess(self, photos: Sequence, *, mixed: Mixed = MIXED, process_res: int | None = None) -> ImageBatch:
+        """Resize to the longest side, by default 504, the aspect kept up to whole patches, as in the benchmark."""
+        side, patch = process_res or self.spec.default_side, self.config.patch_size
         return vggt_images.preprocess(photos, side=side, patch=patch, mixed=mixed)
 
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:

@@ -82,6 +82,7 @@ def _entry(name: str, licence: str, hub_id: str, hub_file: str, *, gated: bool) 
         name=name,
         patch_size=VGGT_1B.patch_size,
         default_side=504,
+        sides=(252, 1008),
         loss_layers=VGGT_1B.out_layers,
         reference="first",
         special_tokens=VGGT_1B.special,
