@@ -37,7 +37,7 @@ QUICK, SLOW = ("pycolmap", "pillow_heif", "OpenEXR", "viser"), ("rerun", "ray", 
 """Modules of extras by how long they take to load."""
 CORE = ("numpy", "PIL", "cv2", "av", "scipy")
 """Modules with libraries of their own that freegeo cannot do without, beside torch."""
-PATIENCE_S = 2.0
+PATIENCE_S = 5.0
 """How long loading of extras may take; what has not loaded by then is installed and was not tried."""
 SETTINGS = ("HF_HOME", "HF_HUB_CACHE", "HF_HUB_OFFLINE", "HF_ENDPOINT")
 _SHOWN = 200
