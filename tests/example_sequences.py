@@ -9,6 +9,7 @@ from freegeo import files
 from freegeo.export.kept import save_kept
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.fusion.filtering import FilterReport
+from freegeo.sequence.chunks import runs
 
 RADIUS, HALF_WIDTH, HALF_HEIGHT = 10.0, 1.5, 1.2
 CHUNK, OVERLAP = 24, 8
@@ -122,7 +123,8 @@ def sequence_of(frames: int, *, cut: int | None = None, missing: int | None = No
         span = sorted({frame for c in own for frame in range(c["first"], c["last"] + 1)} - taken)
         taken.update(span)
         folder = f"pieces/{number + 1}" if number else "."
-        pieces.append({"folder": folder, "first": span[0], "last": span[-1], "frames": len(span)})
+        ranges = [[run[0], run[-1]] for run in runs(span)]
+        pieces.append({"folder": folder, "first": span[0], "last": span[-1], "frames": len(span), "ranges": ranges})
     return {
         "frames": frames, "order": "given", "chunk": CHUNK, "overlap": OVERLAP, "chunks": chunks, "seams": seams,
         "loops": loops, "pieces": pieces,

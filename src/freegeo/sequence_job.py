@@ -399,7 +399,10 @@ class SequenceJob(Job):
                 for loop in loops
             ],
             "pieces": [
-                {"folder": _piece_folder(k), "first": own[0], "last": own[-1], "frames": len(own)}
+                {
+                    "folder": _piece_folder(k), "first": own[0], "last": own[-1], "frames": len(own),
+                    "ranges": [[run[0], run[-1]] for run in runs(own)],
+                }
                 for k, own in enumerate(found.frames)
             ],
         }  # fmt: skip

@@ -111,7 +111,8 @@ def test_chunks_become_one_result(freegeo, walk, tiny, tmp_path, oracle, truth):
     seams = [(seam["first"], seam["second"], seam["kind"], seam["frames"]) for seam in about["seams"]]
     assert seams == [(0, 1, "neighbours", 3), (1, 2, "neighbours", 3), (2, 3, "neighbours", 3)]
     assert all(seam["used"] and seam["inliers"] > 0.99 and seam["gap"] < 1e-3 for seam in about["seams"])
-    assert about["pieces"] == [{"folder": ".", "first": 0, "last": FRAMES - 1, "frames": FRAMES}]
+    (piece,) = about["pieces"]
+    assert piece == {"folder": ".", "first": 0, "last": FRAMES - 1, "frames": FRAMES, "ranges": [[0, FRAMES - 1]]}
     assert len(list((tmp_path / "out/colmap").rglob("*.png"))) == FRAMES
 
 

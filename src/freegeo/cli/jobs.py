@@ -25,14 +25,12 @@ from freegeo.cli.options import (
     refines_with,
 )
 from freegeo.errors import UserError
-from freegeo.export import reconstruction as npz
-from freegeo.export.base import KEPT_NAME, TRACKS_NAME
-from freegeo.export.formats import FORMATS
 from freegeo.export.photos import FOLDER as COPIES_FOLDER
 from freegeo.export.photos import write_copies
 from freegeo.files import ledger, read_json
 from freegeo.models.spec import MIXED, Mixed, PoseFrom
 from freegeo.progress import step_bar
+from freegeo.report.contents import FILES
 from freegeo.run_folder import check_folder, run_folder, stored_state
 
 if TYPE_CHECKING:
@@ -78,21 +76,6 @@ LABELS = {
     "judged_by": "the predictions that the guard judges by",
 }  # fmt: skip
 """What messages call the settings of an output folder."""
-FILES = {
-    "report.html": "the page to look at first",
-    npz.FORMAT.path: npz.FORMAT.about,
-    "frozen/prediction.npz": "the same before adaptation",
-    "unrefined/prediction.npz": "the same before refinement",
-    "predicted/prediction.npz": "as the model predicted it, before known or shared cameras and scale",
-    TRACKS_NAME: "measured points of the refinement",
-    KEPT_NAME: "which pixels the filters kept as points",
-    "adapter": "the adapter (peft format)",
-    **{format.path: format.about for format in FORMATS.values()},
-    "chunks": "predictions of the chunks; they may be removed when the result is finished",
-    "pieces": "parts of the photos that could not be joined to the result",
-    COPIES_FOLDER: "upright copies of the photos (undistorted ones), or the frames of the video that were used",
-    "reconstruction.json": "settings, timings, versions, licence of the weights",
-}
 
 
 @contextmanager
@@ -455,7 +438,7 @@ def describe(summary: dict[str, Any], folder: Path) -> None:
     say_answer(summary)
     console.say(f"{len(summary['images'])} views at {summary['image_hw'][1]} x {summary['image_hw'][0]} pixels")
     if summary["known_cameras"]:
-        say_known(summary["known_cameras"])
+        say_known(summary)
     if summary["scale"]:
         spread = summary["scale"]["spread"]
         certain = "" if spread is None else f", to {100 * spread:.2g} %"
@@ -470,12 +453,18 @@ def describe(summary: dict[str, Any], folder: Path) -> None:
     console.written(folder, FILES)
 
 
-def say_known(about: dict[str, Any]) -> None:
+def say_known(summary: dict[str, Any]) -> None:
     """Print what known cameras made of the prediction."""
+    from freegeo.report.answer import rescaled
+
+    about = summary["known_cameras"]
     parts = [f"poses of {about['poses']} and intrinsics of {about['intrinsics']} photos as given"]
+    metres = rescaled(summary)
+    if metres is not None:
+        parts[0] += f", positions times {metres:.4g} to be metres"
     if about["scale"] is not None:
         measured = about.get("measured")
-        factor = 1 if measured is None else measured["factor"]
+        factor = (metres or 1) * (1 if measured is None else measured["factor"])
         by = "" if measured is None else f" (by {measured['points']:,} points that matches measure with these cameras)"
         parts.append(f"depth times {about['scale'] * factor:.4g}{by}")
     if about["rotation_deg"] is not None:

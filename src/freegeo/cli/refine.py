@@ -8,7 +8,7 @@ from typing import Annotated
 from freegeo.cli import console
 from freegeo.cli.export import find_photos, result_folder, stored_summary
 from freegeo.cli.files import FORMAT_NAMES, require_complete
-from freegeo.cli.jobs import FILES, say_answer, say_finished
+from freegeo.cli.jobs import say_answer, say_finished
 from freegeo.cli.options import OutputOptions
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.base import DEFAULT_FORMATS
@@ -40,6 +40,7 @@ def refine(
     from freegeo.lock import kept_still
     from freegeo.models.checkpoints import fingerprint
     from freegeo.refined import refine_by_photos
+    from freegeo.report.contents import FILES
     from freegeo.report.page import write_report
     from freegeo.run_folder import run_folder
 

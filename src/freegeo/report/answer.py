@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from freegeo.export.reconstruction import METRIC_MODEL
+
 Outcome = Literal["yes", "no", "unknown"]
 
 HEADER = ("model", "epipolar error, px", "reprojection error, px", "contradicted pixels, %", "matches", "sure, %")
@@ -56,6 +58,15 @@ def answer(summary: Mapping[str, Any]) -> Answer | None:
     if not parts:
         return None
     return Answer(parts=tuple(parts), rows=tuple(_rows(summary)), advice=tuple(_advice(summary, parts)))
+
+
+def rescaled(summary: Mapping[str, Any]) -> float | None:
+    """Return the factor by which `--scale` changed known positions; None where they are in the result as given."""
+    known, scale = summary.get("known_cameras"), summary.get("scale")
+    if not known or not known["poses"] or not scale:
+        return None
+    own = METRIC_MODEL, f"the known cameras in {known['source']}"
+    return None if scale["source"] in own else float(scale["value"])
 
 
 def _adaptation(summary: Mapping[str, Any]) -> Iterator[Part]:

@@ -11,7 +11,8 @@ import numpy as np
 from freegeo import files
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.report import figures, sequence
-from freegeo.report.answer import HEADER, NOTE, answer
+from freegeo.report.answer import HEADER, NOTE, answer, rescaled
+from freegeo.report.contents import FILES
 from freegeo.report.pairs import PairPicture, pair_pictures
 from freegeo.report.result import LABELS, MANY_VIEWS, REPORT_NAME, Result, camera_difference, even_choice, load_result
 from freegeo.report.scene3d import ERROR_LIMIT, drawn_cameras, most_kept, scene_data
@@ -22,9 +23,11 @@ Range = tuple[float, float]
 CHANGE_LIMIT = 0.2
 """Relative depth change at the end of the colour scale."""
 SOME_VIEWS, NARROW_WIDTH = 16, 224
-"""With more than `SOME_VIEWS` views, pictures are at most `NARROW_WIDTH` pixels wide."""
-VIEWS_A_PAGE = 12
-"""Views of the gallery that are shown at once, when it does not show all of them."""
+"""With more than `SOME_VIEWS` views, maps are at most `NARROW_WIDTH` pixels wide."""
+PHOTO_SIDE, PHOTO_SIDE_OF_MANY = 720, 512
+"""Longer side of the photos, in pixels, up to `SOME_VIEWS` views and with more."""
+MOST_AT_ONCE, VIEWS_A_PAGE = 8, 6
+"""Views of the gallery that are shown at once: up to the first number all, of more as many as the second."""
 MOST_WARNINGS = 12
 """Warnings that are shown at the top; the others are behind a click."""
 SCORE_LABELS = {
@@ -50,7 +53,7 @@ def write_report(
         folder: holds prediction.npz and, where there, reconstruction.json, frozen/, adapter/ and scores.json.
         truth: ground truth at the prediction's resolution, in any world frame; default: `truth/prediction.npz` of the
             folder, if there.
-        photos: of the result, in which matches are drawn; None: they are drawn in the images that the model read.
+        photos: of the result, which are shown and in which matches are drawn; None: the images that the model read.
 
     Raises:
         UserError: no reconstruction there, or one of a newer format.
@@ -60,11 +63,11 @@ def write_report(
     pairs = pair_pictures(result.folder, result.full[result.final.key], photos)
     path = result.folder / REPORT_NAME
     with files.atomic_path(path) as part:
-        part.write_text(render(result, pairs), encoding="utf-8")
+        part.write_text(render(result, pairs, photos), encoding="utf-8")
     return path
 
 
-def render(result: Result, pairs: Sequence[PairPicture] = ()) -> str:
+def render(result: Result, pairs: Sequence[PairPicture] = (), photos: Sequence[PhotoLike] | None = None) -> str:
     """The page as text; the template engine escapes values such as names of photos."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
@@ -81,6 +84,7 @@ def render(result: Result, pairs: Sequence[PairPicture] = ()) -> str:
         title=sequence.title(result),
         facts=facts(result),
         answer=answer(result.summary),
+        unasked=unasked(result),
         answer_header=HEADER,
         answer_note=NOTE,
         pairs=pairs,
@@ -94,11 +98,14 @@ def render(result: Result, pairs: Sequence[PairPicture] = ()) -> str:
         most_warnings=MOST_WARNINGS,
         step=result.step,
         has_error=result.truth is not None,
-        views=views(result),
+        views=list(views(result, photos)),
         legends=legends(result),
         view_count=len(numbers),
         shown_views=min(len(numbers), MANY_VIEWS),
+        most_at_once=MOST_AT_ONCE,
         views_a_page=VIEWS_A_PAGE,
+        is_path=result.is_path,
+        own_cameras=[stage.label for stage in result.predictions if stage.own_cameras],
         cameras3d=[f"{numbers[view]}: {result.names[view]}" for view in drawn_cameras(result)],
         plan=Markup(figures.camera_plan(result)) if with_plan else None,
         cameras=camera_rows(result),
@@ -113,17 +120,27 @@ def render(result: Result, pairs: Sequence[PairPicture] = ()) -> str:
         settings=list(flattened(result.summary.get("settings") or {})),
         adaptation=list(flattened({k: v for k, v in result.adaptation.items() if k not in ("loss_curve", "recipe")})),
         versions=list((result.summary.get("versions") or {}).items()),
-        licence=result.summary.get("licence_of_weights"),
         command=result.summary.get("command"),
-        files=[name for name in FILES if (result.folder / name).exists()],
+        files=list(files_beside(result.folder)),
     )
 
 
-FILES = (
-    "points.ply", "scene.glb", "mesh.ply", "colmap", "transforms.json", "depth", "prediction.npz",
-    "frozen/prediction.npz", "unrefined/prediction.npz", "kept.npz", "tracks.npz", "matches.npz", "adapter",
-    "reconstruction.json",
-)  # fmt: skip
+def unasked(result: Result) -> str:
+    """Return what stands in the place of the verdict where neither adaptation nor refinement was asked for."""
+    if not result.summary:
+        return "Nothing is known of how this prediction was made."
+    adapter = result.summary.get("adapter")
+    if adapter:
+        return f"Predicted with the adapter {adapter}. Whether it helps with these photos was not asked."
+    return "The model's own prediction: neither adapted to these photos nor refined."
+
+
+def files_beside(folder: Path) -> Iterator[tuple[str, str, str]]:
+    """Files of a result that exist: name, address relative to the page, purpose."""
+    for name, about in FILES.items():
+        path = folder / name
+        if name != REPORT_NAME and path.exists():
+            yield name, f"{name}/" if path.is_dir() else name, about
 
 
 def facts(result: Result) -> list[tuple[str, str]]:
@@ -136,29 +153,33 @@ def facts(result: Result) -> list[tuple[str, str]]:
         ("views", str(len(result.names))),
         ("resolution", f"{width} × {height}"),
         ("lengths", result.lengths),
-        ("kept pixels", f"{_percent(kept)} of {result.pixels:,}"),
     ]
+    if result.has_cameras:
+        found.append(("kept pixels", f"{_percent(kept)} of {result.pixels:,}"))
     if known := summary.get("known_cameras"):
-        found.append(("known cameras", f"{known['poses']} poses, {known['intrinsics']} intrinsics"))
+        factor = rescaled(summary)
+        more = "" if factor is None else f", positions times {factor:.4g}"
+        found.append(("known cameras", f"{known['poses']} poses, {known['intrinsics']} intrinsics{more}"))
     if summary.get("loss"):
         found.append(("loss", f"{summary['loss']['first']:.4f} → {summary['loss']['last']:.4f}"))
     if summary.get("seconds"):
         found.append(("time", _duration(sum(summary["seconds"].values()))))
+    found.append(("licence of the weights", summary.get("licence_of_weights") or "not stated in this folder"))
     return found
 
 
-def views(result: Result) -> Iterator[dict[str, Any]]:
+def views(result: Result, photos: Sequence[PhotoLike] | None = None) -> Iterator[dict[str, Any]]:
     """One entry per photo, or for each of an even choice: name, title and pictures, each (class, caption, data URI)."""
-    width = figures.MAX_WIDTH if len(result.names) <= SOME_VIEWS else NARROW_WIDTH
+    few = len(result.names) <= SOME_VIEWS
+    width, side = (figures.MAX_WIDTH, PHOTO_SIDE) if few else (NARROW_WIDTH, PHOTO_SIDE_OF_MANY)
     depth_range, conf_range = map_ranges(result)
-    images, numbers = result.full[result.final.key].images, sequence.view_numbers(result)
+    read, numbers = result.full[result.final.key], sequence.view_numbers(result)
     for view in even_choice(len(numbers), MANY_VIEWS):
-        pictures = [("photo", "photo", images[view]), *_maps(result, view, depth_range, conf_range)]
-        yield {
-            "title": f"{numbers[view]}. {result.names[view]}",
-            "name": result.names[view],
-            "pictures": [(kind, caption, figures.data_uri(image, width)) for kind, caption, image in pictures],
-        }
+        photo = read.images[view] if photos is None else figures.photo_as_seen(photos[view].read(), read, view, side)
+        pictures = [("photo", "photo", figures.data_uri(photo, side))]
+        for kind, caption, image in _maps(result, view, depth_range, conf_range):
+            pictures.append((kind, caption, figures.data_uri(image, width)))
+        yield {"title": f"{numbers[view]}. {result.names[view]}", "name": result.names[view], "pictures": pictures}
 
 
 def _maps(result: Result, view: int, depth_range: Range, conf_range: Range) -> Iterator[tuple[str, str, np.ndarray]]:

@@ -36,6 +36,8 @@ MANY_VIEWS = 48
 """Up to so many views, all pixels are read and all views are shown."""
 MOST_PIXELS = 4_000_000
 """About so many pixels of each stage are read of more views."""
+FEWEST_OF_A_PATH, STEP_OF_A_PATH = 8, 1.5
+"""Views of a path, unless they are a sequence; and how many times as far as the nearest camera the next one is."""
 LABELS = {"frozen": "frozen", "adapted": "adapted", "refined": "refined", "truth": "ground truth"}
 
 
@@ -61,11 +63,13 @@ class Stage:
     """Factor from the file's depth to `depth_z`."""
     error: np.ndarray | None = None
     """(S, H, W) float32 |d - d_true| / d_true, NaN where one of them is not valid; None without ground truth."""
+    own_cameras: bool = False
+    """Whether it has the cameras that the model predicted, where the result has known or shared ones."""
 
     @property
     def label(self) -> str:
         """The name shown in the report."""
-        return LABELS[self.key]
+        return f"{LABELS[self.key]}, own cameras" if self.own_cameras else LABELS[self.key]
 
     def world_points(self) -> np.ndarray:
         """World points (S, H, W, 3) float32; UserError without cameras."""
@@ -121,6 +125,19 @@ class Result:
         return self.final.T_cam_world is not None
 
     @property
+    def is_path(self) -> bool:
+        """Whether a line through the cameras shows a way: the photos are a sequence, or each is near the one before."""
+        if self.summary.get("sequence"):
+            return True
+        if self.final.T_cam_world is None or len(self.names) < FEWEST_OF_A_PATH:
+            return False
+        centres = camera_centres(torch.from_numpy(self.final.T_cam_world).double())
+        apart = torch.cdist(centres, centres)
+        steps = apart.diagonal(1).median()
+        nearest = apart.fill_diagonal_(torch.inf).min(1).values.median()
+        return bool(steps <= STEP_OF_A_PATH * nearest)
+
+    @property
     def pixels(self) -> int:
         """Number of pixels of all views."""
         return self.full[self.final.key].depth_z.size
@@ -167,9 +184,12 @@ def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
     last = list(found)[-1]
     reference = read["truth" if truth else last]
     stages = {}
-    for key in found:
-        kept = _kept(read[key], final.depth_z.shape, places[key], step) if read[key].has_cameras else None
-        stages[key] = _stage(key, read[key], reference, read.get("truth"), kept)
+    replaced = bool(summary.get("known_cameras") or summary.get("one_camera"))
+    for key, place in places.items():
+        kept = _kept(read[key], final.depth_z.shape, place, step) if read[key].has_cameras else None
+        stage = _stage(key, read[key], reference, read.get("truth"), kept)
+        # The frozen prediction stays as it was; what comes after it has the other cameras.
+        stages[key] = replace(stage, own_cameras=replaced and place == folder / FROZEN_FOLDER)
     if truth is not None:
         stages["truth"] = _truth_stage(read["truth"])
     return Result(

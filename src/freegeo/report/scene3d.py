@@ -21,6 +21,13 @@ MOST_PATH = 2_000
 ERROR_LIMIT = 0.3
 """Relative depth error at the end of the colour scale."""
 NO_ERROR = 255
+YAW, PITCH, STEEP = 0.4, 0.45, 0.95
+"""Angles of the first view in radians, to the right and from above; steep over cameras that look all round, where
+walls would hide what is between them."""
+LOOK_ALL_ROUND = 0.5
+"""Length of the mean viewing direction below which cameras do."""
+FILLED = 0.93
+"""Share of the picture that the first view fills."""
 
 
 def level_rotation(T_cam_world: np.ndarray) -> np.ndarray:
@@ -61,21 +68,74 @@ def scene_data(result: Result) -> dict[str, Any]:
     target = np.quantile(seen, (0.03, 0.97), axis=0).mean(axis=0)
     radius = float(np.quantile(np.linalg.norm(seen - target, axis=1), 0.9)) or 1.0
     spacing = float(np.median(_covered(final)[final.keep])) if final.keep.any() else radius / 100
+    yaw, pitch = first_angles(final)
     return {
         "target": _rounded(target),
         "radius": radius,
+        "yaw": yaw,
+        "pitch": pitch,
         "stages": [
             {
                 "key": stage.key,
                 "label": stage.label,
                 **_packed(stage, points[stage.key], result.images, spacing, most_kept(result)),
                 "cameras": _cameras(stage, drawn_cameras(result), level, frustum_depth(stage, 0.1 * radius)),
-                "path": _path(stage, level),
+                "path": _path(stage, level) if result.is_path else [],
                 "spacing": spacing,
             }
             for stage in result.stages.values()
         ],
     }
+
+
+def first_angles(stage: Stage) -> tuple[float, float]:
+    """Angles of the first view of the level frame in radians: to the right, and from above."""
+    assert stage.T_cam_world is not None
+    mean_direction = stage.T_cam_world[:, 2, :3].astype(np.float64).mean(0)
+    return YAW, STEEP if np.linalg.norm(mean_direction) < LOOK_ALL_ROUND else PITCH
+
+
+def first_view(
+    stage: Stage, level: np.ndarray, centre: np.ndarray, *, frusta: float, fov: float, aspect: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the page's first view for another viewer: all cameras and nearly all points just fill the picture.
+
+    Args:
+        stage: whose kept points and cameras are shown.
+        level: rotation (3, 3) from the world to the level frame.
+        centre: (3,) in the world, of the points.
+        frusta: how deep cameras are drawn.
+        fov: vertical field of view in radians.
+        aspect: width over height of the picture.
+
+    Returns:
+        Place of the eye (3,), and the place (3,) it looks at, as far away as `centre`.
+    """
+    yaw, pitch = first_angles(stage)
+    back = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
+    right = np.array([np.cos(yaw), 0, -np.sin(yaw)])
+    axes = np.stack((right, np.cross(back, right), back)) @ level
+    points = kept_points(stage) @ axes.T
+    corners = np.array(_cameras(stage, list(range(len(stage.depth_z))), axes, frusta)).reshape(-1, 3)
+    tall = FILLED * np.tan(fov / 2)
+
+    def reach(axis: int, slope: float) -> float:
+        """Of all that is to be inside a plane of the view, the most of what the eye must not fall below."""
+        values, ends = (np.sign(slope) * x[:, axis] + abs(slope) * x[:, 2] for x in (points, corners))
+        middle, high, most = np.quantile(values, (0.5, 0.98, 1))
+        return float(max(min(most, high + 0.5 * (high - middle)), ends.max()))
+
+    slopes = (tall * aspect, tall)
+    both = [(reach(axis, slope), reach(axis, -slope)) for axis, slope in enumerate(slopes)]
+    away = max((first + second) / (2 * slope) for (first, second), slope in zip(both, slopes, strict=True))
+    eye = np.array([*((first - second) / 2 for first, second in both), away]) @ axes
+    return eye, eye - axes[2] * ((eye - centre) @ axes[2])
+
+
+def kept_points(stage: Stage) -> np.ndarray:
+    """World points (n, 3) of the kept pixels, or of all where none is kept."""
+    points = stage.world_points()
+    return points[stage.keep] if stage.keep.any() else points.reshape(-1, 3)
 
 
 def _packed(stage: Stage, points: np.ndarray, images: np.ndarray, spacing: float, most: int) -> dict[str, Any]:
@@ -153,7 +213,7 @@ def _centres(stage: Stage) -> np.ndarray:
 
 
 def _path(stage: Stage, level: np.ndarray) -> list[list[float]]:
-    """Positions of the cameras, in order; empty where all of them are drawn."""
+    """Positions of the cameras, one after the other; empty where all of them are drawn."""
     assert stage.T_cam_world is not None
     if len(stage.T_cam_world) <= MOST_CAMERAS:
         return []

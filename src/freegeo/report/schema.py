@@ -93,10 +93,19 @@ class Loop(TypedDict):
     used: bool
 
 
+class PieceRecord(TypedDict, total=False):
+    """A part of a sequence that was joined."""
+
+    folder: Required[str]
+    ranges: list[list[int]]
+    """First and last frame of each run of frames that the piece has."""
+
+
 class SequenceRecord(TypedDict):
     """How a long sequence was joined."""
 
     chunks: list[ChunkRecord]
+    pieces: list[PieceRecord]
     seams: list[Seam]
     loops: list[Loop]
 

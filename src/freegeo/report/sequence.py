@@ -109,12 +109,8 @@ def frames_of(result: Result) -> list[int] | None:
     sequence = result.summary.get("sequence")
     if not sequence:
         return None
-    taken: set[int] = set()
-    frames: list[int] = []
-    for piece in range(_piece_number(result.folder, sequence) + 1):
-        # A frame of two pieces is in the first of them.
-        frames = sorted({frame for chunk in _chunks(sequence, piece) for frame in _range(chunk)} - taken)
-        taken.update(frames)
+    piece = sequence["pieces"][_piece_number(result.folder, sequence)]
+    frames = [frame for first, last in piece.get("ranges", ()) for frame in range(first, last + 1)]
     return frames if len(frames) == len(result.names) else None
 
 
@@ -164,10 +160,6 @@ def _middle(first: Mapping[str, Any], second: Mapping[str, Any]) -> int:
 
 def _chunks(sequence: Mapping[str, Any], piece: int) -> list[Mapping[str, Any]]:
     return sorted((c for c in sequence["chunks"] if c["piece"] == piece), key=lambda chunk: chunk["first"])
-
-
-def _range(chunk: Mapping[str, Any]) -> range:
-    return range(chunk["first"], chunk["last"] + 1)
 
 
 def _sentences(sequence: Mapping[str, Any]) -> list[str]:

@@ -28,7 +28,14 @@ from freegeo.report.answer import answer
 from freegeo.report.figures import CONF_MAP, DEPTH_MAP, ERROR_MAP, linear_colours, log_colours, log_range
 from freegeo.report.origin import own_pages_only, require_free_port
 from freegeo.report.result import Result, Stage, even_choice, load_result, moved, moved_by
-from freegeo.report.scene3d import ERROR_LIMIT, MOST_CAMERAS, frustum_depth, level_rotation
+from freegeo.report.scene3d import (
+    ERROR_LIMIT,
+    MOST_CAMERAS,
+    first_view,
+    frustum_depth,
+    kept_points,
+    level_rotation,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +44,8 @@ MAX_POINTS = 600_000
 """Most points of one stage that are sent to the browser; of more, a seeded choice."""
 THUMBNAIL_WIDTH = 240
 FRUSTUM_SHARE = 0.06
+FIRST_FOV, FIRST_ASPECT = np.deg2rad(50), 1.0
+"""Of the first view; browser windows are broader, but their right end is the panel's."""
 STAGE_COLOURS = {
     "frozen": (214, 122, 32), "adapted": (42, 124, 204), "refined": (150, 70, 190), "truth": (64, 160, 92),
 }  # fmt: skip
@@ -103,8 +112,10 @@ class Viewer:
         self.server.scene.set_up_direction(level[1])
         self.server.scene.configure_default_lights(cast_shadow=False)
         first = self.server.initial_camera
-        first.look_at = centre
-        first.position = centre + self.radius * (np.array([0.7, 0.9, 1.7]) @ level)
+        frusta = frustum_depth(final, FRUSTUM_SHARE * self.radius)
+        eye, first.look_at = first_view(final, level, centre, frusta=frusta, fov=FIRST_FOV, aspect=FIRST_ASPECT)
+        first.position = eye
+        first.fov = FIRST_FOV
         first.up = level[1]
         first.near, first.far = 1e-3 * self.radius, 1e3 * self.radius
 
@@ -139,7 +150,7 @@ class Viewer:
             )  # fmt: skip
             handle.on_click(lambda _, view=view: self._set_follow(view))
             yield handle
-        if len(places) > MOST_CAMERAS:
+        if len(places) > MOST_CAMERAS and layer.result.is_path:
             ends = np.stack((places[:-1], places[1:]), axis=1)
             yield self.server.scene.add_line_segments(f"{layer.name}/path", ends, colour, thickness=0.004 * self.radius)
 
@@ -282,8 +293,7 @@ def _extent(stage: Stage) -> tuple[np.ndarray, np.ndarray, float]:
     """Rotation (3, 3) to a level frame, centre (3,) of the kept points, and a radius that holds most of them."""
     assert stage.T_cam_world is not None
     level = level_rotation(stage.T_cam_world)
-    points = stage.world_points()
-    seen = points[stage.keep] if stage.keep.any() else points.reshape(-1, 3)
+    seen = kept_points(stage)
     centre = np.quantile(seen @ level.T, (0.03, 0.97), axis=0).mean(axis=0) @ level
     return level, centre, float(np.quantile(np.linalg.norm(seen - centre, axis=1), 0.9)) or 1.0
 

@@ -5,17 +5,18 @@
   const canvas = document.getElementById("canvas3d");
   const context = canvas.getContext("2d");
   const byId = (id) => document.getElementById(id);
-  const FOV = 50 * Math.PI / 180, NEAR = 0.02, MOST_PIXELS = 1.6e6, BIGGEST_SPLAT = 24, SHADING = 3;
+  const FOV = 50 * Math.PI / 180, FILLED = 0.93, NEAR = 0.02, MOST_PIXELS = 1.6e6, BIGGEST_SPLAT = 24, SHADING = 3;
 
   function unpack(stage) {
     const bytes = Uint8Array.from(atob(stage.points), (letter) => letter.charCodeAt(0));
     const n = stage.count;
     let at = 0;
     const take = (size) => bytes.subarray(at, at += size * n);
-    return {
+    const found = {
       ...stage, points: null, n,
       xyz: new Float32Array(take(12).slice().buffer), rgb: take(3), rank: take(1), error: take(1), kept: take(1), width: take(1),
     };
+    return { ...found, shown: [...found.kept.keys()].filter((i) => found.kept[i]) };
   }
   const stages = Object.fromEntries(scene.stages.map((stage) => [stage.key, unpack(stage)]));
 
@@ -39,10 +40,30 @@
   }
 
   const state = { stage: "", colour: "photo", size: 2, conf: 0, cameras: true, removed: false };
-  let view;
+  let view, isFirst;  // Whether the view is still the first one, which follows the size of the canvas.
+  // All cameras and the points just fill the picture; points that lie far from the others do not make it smaller.
   function resetView() {
-    const box = canvas.getBoundingClientRect(), narrow = Math.min(1, box.width / Math.max(1, box.height));
-    view = { target: [...scene.target], distance: 2.2 * scene.radius / narrow, yaw: 0.4, pitch: 0.45, fov: FOV };
+    view = { target: [0, 0, 0], distance: 0, yaw: scene.yaw, pitch: scene.pitch, fov: FOV };
+    isFirst = true;
+    const { back, right, up } = axes(), box = canvas.getBoundingClientRect(), stage = stages[state.stage];
+    const tall = FILLED * Math.tan(FOV / 2), wide = tall * box.width / Math.max(1, box.height);
+    const drawn = [...stage.cameras.flat(), ...stage.path];
+    // A point is inside a plane of the view if what it gives here is at most what the eye gives.
+    const reach = (axis, slope) => {
+      const values = Float32Array.from(stage.shown, (i) => {
+        const point = stage.xyz.subarray(3 * i, 3 * i + 3);
+        return dot(axis, point) + slope * dot(back, point);
+      }).sort();
+      const at = (share) => values[Math.round(share * (values.length - 1))];
+      const most = values.length ? Math.min(at(1), at(0.98) + 0.5 * (at(0.98) - at(0.5))) : -Infinity;
+      return drawn.reduce((far, corner) => Math.max(far, dot(axis, corner) + slope * dot(back, corner)), most);
+    };
+    const [east, west] = [reach(right, wide), reach(right.map((value) => -value), wide)];
+    const [north, south] = [reach(up, tall), reach(up.map((value) => -value), tall)];
+    const away = Math.max((east + west) / (2 * wide), (north + south) / (2 * tall));
+    const eye = [0, 1, 2].map((k) => right[k] * (east - west) / 2 + up[k] * (north - south) / 2 + back[k] * away);
+    view.distance = Math.max(away - dot(back, scene.target), 0.1 * scene.radius);
+    view.target = eye.map((value, k) => value - view.distance * back[k]);
   }
   const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -62,6 +83,7 @@
     if (!corners) return;
     const middle = [0, 1, 2].map((k) => (corners[1][k] + corners[2][k] + corners[3][k] + corners[4][k]) / 4);
     const ahead = sub(middle, corners[0]), size = length(ahead);
+    isFirst = false;
     view.distance = scene.radius;
     view.target = corners[0].map((value, k) => value + view.distance * ahead[k] / size);
     view.pitch = Math.asin(Math.min(Math.max(-ahead[1] / size, -1), 1));
@@ -189,7 +211,7 @@
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, [event.clientX, event.clientY]);
     active = true;
-    byId("hint3d").classList.add("gone");
+    isFirst = false;
   });
   canvas.addEventListener("pointermove", (event) => {
     const before = pointers.get(event.pointerId);
@@ -216,6 +238,7 @@
   canvas.addEventListener("wheel", (event) => {
     if (!active) return;
     event.preventDefault();
+    isFirst = false;
     zoom(Math.exp(0.001 * event.deltaY));
     draw();
   }, { passive: false });
@@ -226,6 +249,7 @@
     }[event.key];
     if (!action) return;
     event.preventDefault();
+    isFirst = false;
     action();
     draw();
   });
@@ -256,10 +280,13 @@
     resetView();
     draw();
   });
-  new ResizeObserver(draw).observe(canvas);
+  new ResizeObserver(() => {
+    if (isFirst) resetView();
+    draw();
+  }).observe(canvas);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
-  resetView();
   readControls();
+  resetView();
   follow();
   draw();
 })();
