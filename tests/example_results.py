@@ -8,6 +8,7 @@ import torch
 
 from exact_rooms import room
 from freegeo import files
+from freegeo.data.photos import MemoryPhoto
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.geometry.rotation import quat_xyzw_to_matrix
 from freegeo.geometry.se3 import camera_centres, from_Rt
@@ -40,6 +41,20 @@ def disturbed(exact: Reconstruction, amount: float, seed: int, *, scale: float =
 def rotation_about_z(angle: float) -> torch.Tensor:
     c, s = np.cos(angle), np.sin(angle)
     return torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+
+
+def finer_photos(folder: Path, times: int = 10) -> list[MemoryPhoto]:
+    """Photos of an example, so many times as fine as what the model read, which the example then says."""
+    result = Reconstruction.load(folder)
+    views = len(result.names)
+    replace(
+        result, photo_hw=np.tile(np.array(result.image_hw) * times, (views, 1)),
+        scale_xy=np.full((views, 2), 1 / times), offset_xy=np.zeros((views, 2)),
+    ).save(folder)  # fmt: skip
+    return [
+        MemoryPhoto(name, image.repeat(times, 0).repeat(times, 1))
+        for name, image in zip(result.names, result.images, strict=True)
+    ]
 
 
 def write_example(

@@ -44,10 +44,12 @@ def open_page(chromium):
         if message.type == "error":
             complaints.append(message.text)
 
-    def open_it(address, width=1280, height=900, dark=False, touch=False):
+    def open_it(address, width=1280, height=900, dark=False, touch=False, script=""):
         context = chromium.new_context(
             viewport={"width": width, "height": height}, color_scheme="dark" if dark else "light", has_touch=touch
         )
+        if script:
+            context.add_init_script(script)
         page = context.new_page()
         pages.append(context)
         page.on("console", note_message)

@@ -1,13 +1,17 @@
 """The report is opened from its file, moved and switched, and its pictures change as they should."""
 
 import base64
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import numpy as np
 import pytest
 
-from example_results import HOSTILE_NAME, write_example
+from example_results import HOSTILE_NAME, finer_photos, write_example
 from example_sequences import write_sequence
-from freegeo.report.page import write_report
+from freegeo import files
+from freegeo.report.page import VIEWS_A_PAGE, write_report
 
 PIXELS = """() => {
   const canvas = document.getElementById("canvas3d");
@@ -16,6 +20,13 @@ PIXELS = """() => {
   for (let at = 0; at < data.length; at += 8192) text += String.fromCharCode(...data.subarray(at, at + 8192));
   return btoa(text);
 }"""
+RECORD_LINES = """
+  window.corners = [];
+  for (const name of ["moveTo", "lineTo"]) {
+    const draw = CanvasRenderingContext2D.prototype[name];
+    CanvasRenderingContext2D.prototype[name] = function (x, y) { window.corners.push([x, y]); draw.call(this, x, y); };
+  }
+"""
 LUMINANCE = """(element) => {
   const parts = (text) => text.match(/[\\d.]+/g).map(Number);
   const light = ([r, g, b]) => [r, g, b].map((v) => v / 255)
@@ -100,6 +111,36 @@ def test_the_3d_view_follows_its_controls(open_page, address):
     assert drawn(canvas(page)) > drawn(start)
 
 
+@pytest.mark.parametrize(("width", "height"), [(1400, 900), (390, 844)])
+@pytest.mark.parametrize("views", ["address", "many"])
+def test_the_first_view_holds_the_cloud_and_all_cameras(open_page, request, views, width, height):
+    page = open_page(request.getfixturevalue(views), width=width, height=height, script=RECORD_LINES)
+    canvas(page)
+    corners = np.array(page.evaluate("corners"))
+    size = np.array(
+        page.evaluate("[document.getElementById('canvas3d').width, document.getElementById('canvas3d').height]")
+    )
+    cameras = page.evaluate("JSON.parse(document.getElementById('scene-data').textContent).stages[0].cameras.length")
+    assert len(corners) % (16 * cameras) == 0 and len(corners) > 0
+    assert (corners > 0).all() and (corners < size).all()
+    alpha = canvas(page)[:, 3].reshape(size[1], size[0])
+    edges = [alpha[:2], alpha[-2:], alpha[:, :2], alpha[:, -2:]]
+    assert not any(edge.any() for edge in edges), "nothing is cut off"
+    rows, columns = (np.flatnonzero(alpha.any(axis)) for axis in (1, 0))
+    assert max(np.ptp(rows) / size[1], np.ptp(columns) / size[0]) > 0.8, "and the picture is filled"
+    view, hint = (page.locator(name).bounding_box() for name in ("#canvas3d", ".hint"))
+    assert hint["y"] >= view["y"] + view["height"], "the hint lies over nothing"
+
+
+def test_the_first_view_follows_the_window_until_it_was_moved(open_page, address):
+    page = open_page(address, width=1400, height=900)
+    canvas(page)
+    page.set_viewport_size({"width": 390, "height": 844})
+    narrow = canvas(page)
+    other = open_page(address, width=390, height=844)
+    assert np.array_equal(narrow, canvas(other))
+
+
 def test_mouse_wheel_and_keys_move_the_view(open_page, address):
     page = open_page(address, width=800, height=600)
     page.uncheck("#cameras3d")
@@ -176,7 +217,7 @@ def test_maps_and_models_are_chosen(open_page, address):
     assert all(complete and width == 64 for complete, width in pictures)
     page.locator(".enlarge >> nth=1").click()
     assert page.locator("dialog img").count() == 2
-    page.locator("dialog button").click()
+    page.click("#large-close")
     assert not page.locator("dialog").is_visible()
 
 
@@ -215,6 +256,90 @@ def test_it_is_readable_everywhere(open_page, address, width, dark):
 
 
 @pytest.fixture(scope="module")
+def many(tmp_path_factory):
+    """32 views, with and without adaptation, and photos that are finer than what the model read."""
+    folder = write_example(tmp_path_factory.mktemp("many") / "out", views=32)
+    scores = {"epipolar_px": 2.0, "reprojection_px": 3.0, "depth_agreement": 0.9, "matches": 1200}
+    told = {
+        "recipe": {"name": "scene", "lr": 1e-3, "hold": 1.0, "steps": 60},
+        "verdict": {"outcome": "adapted", "reason": "Matches fit better.", "frozen": scores},
+        "refinement": {"accepted": False, "reason": "Too few pairs.", "lacking": "matches", "probability": 0.5},
+    }
+    files.write_json(folder / "reconstruction.json", {**files.read_json(folder / "reconstruction.json"), **told})
+    return write_report(folder, photos=finer_photos(folder)).as_uri()
+
+
+def test_the_page_is_short(open_page, many):
+    page = open_page(many, width=1400, height=900)
+    assert page.locator(".view:visible").count() == VIEWS_A_PAGE
+    assert page.evaluate("document.documentElement.scrollHeight - innerHeight") < 3 * 900
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_an_enlarged_photo_leads_to_the_others(open_page, many):
+    page = open_page(many, width=1400, height=900)
+    page.locator(".view:visible .enlarge").first.focus()
+    page.keyboard.press("Enter")
+    picture = page.locator("dialog img")
+    assert picture.count() == 1
+    assert picture.evaluate("image => image.naturalWidth") >= 512
+    assert picture.bounding_box()["width"] >= 512
+    back, ahead = page.locator("#large-back"), page.locator("#large-ahead")
+    assert back.is_disabled() and page.inner_text("dialog output") == "1 of 32"
+    alt = picture.get_attribute("alt")
+    page.keyboard.press("ArrowLeft")
+    assert picture.get_attribute("alt") == alt
+    ahead.click()
+    for _ in range(6):
+        page.keyboard.press("ArrowRight")
+    assert page.inner_text("dialog output") == "8 of 32"
+    assert page.inner_text("#large-title") == page.locator(".view h3").nth(7).text_content()
+    back.click()
+    page.keyboard.press("Escape")
+    assert not page.locator("dialog").is_visible()
+    assert page.inner_text(".pager output") == "7 to 12 of 32", "the photo that was seen last is on the page"
+    assert page.evaluate("document.activeElement.querySelector('img').alt") == "photo of photo 6.JPG"
+    page.locator(".view:visible .depth .enlarge").first.click()
+    page.keyboard.press("ArrowRight")
+    assert page.locator("dialog figcaption").all_inner_texts() == ["photo", "depth, frozen"]
+    while ahead.is_enabled():
+        page.keyboard.press("ArrowRight")
+    assert page.inner_text("dialog output") == "32 of 32"
+
+
+def test_links_lead_to_files_that_are_there(open_page, many):
+    page = open_page(many)
+    links = page.locator("#files a")
+    found = [Path(url2pathname(urlsplit(link.evaluate("a => a.href")).path)) for link in links.all()]
+    assert {file.name for file in found} >= {"prediction.npz", "adapter", "reconstruction.json"}
+    assert all(file.exists() for file in found)
+    assert all(link.get_attribute("href").split("/")[0] not in ("", "..", "file:") for link in links.all())
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_keys_reach_everything_and_it_shows(open_page, many, dark):
+    page = open_page(many, width=1400, height=900, dark=dark)
+    assert page.evaluate("[...document.images].every((image) => image.alt)")
+    named = """(e) => e.getAttribute("aria-label") || e.innerText || e.closest("label")?.innerText
+      || e.querySelector("img")?.alt"""
+    for control in page.locator("button:visible, select, input, canvas").all():
+        assert control.evaluate(named), control.evaluate("e => e.outerHTML.slice(0, 200)")
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        ring = page.evaluate(
+            """() => {
+              const here = document.activeElement;
+              const style = getComputedStyle(here.matches(".segments input") ? here.nextElementSibling : here);
+              return [here.tagName, style.outlineStyle, parseFloat(style.outlineWidth)];
+            }"""
+        )
+        assert ring[0] == "BODY" or (ring[1] == "solid" and ring[2] >= 2), ring
+    for selector in (".verdict.yes b", ".verdict.no b", "#files a", "#files span", ".hint", ".pager output"):
+        assert page.locator(selector).first.evaluate(LUMINANCE) >= 4.5, selector
+
+
+@pytest.fixture(scope="module")
 def walk(tmp_path_factory):
     folders = write_sequence(tmp_path_factory.mktemp("walk") / "out", 200, cut=8, unused=3)
     return [write_report(folder) for folder in reversed(folders)][-1].as_uri()
@@ -223,7 +348,7 @@ def walk(tmp_path_factory):
 def test_many_views_are_turned_over_like_pages(open_page, walk):
     page = open_page(walk)
     shown = page.locator(".view:visible h3")
-    assert shown.count() == 12 and shown.first.inner_text() == "frame 0. frame_00000.jpg"
+    assert shown.count() == VIEWS_A_PAGE and shown.first.inner_text() == "frame 0. frame_00000.jpg"
     back, ahead = page.locator(".pager button").all()
     assert back.is_disabled()
     seen = shown.all_inner_texts()
@@ -231,9 +356,9 @@ def test_many_views_are_turned_over_like_pages(open_page, walk):
         ahead.click()
         seen += shown.all_inner_texts()
     assert len(set(seen)) == len(seen) == 48
-    assert page.inner_text(".pager output") == "37 to 48 of 48"
+    assert page.inner_text(".pager output") == "43 to 48 of 48"
     back.click()
-    assert page.inner_text(".pager output") == "25 to 36 of 48"
+    assert page.inner_text(".pager output") == "37 to 42 of 48"
 
 
 def test_a_line_joins_the_cameras_of_a_long_sequence(open_page, walk):

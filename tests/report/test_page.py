@@ -1,20 +1,25 @@
 import base64
 import dataclasses
 import html
+import io
 import json
 import re
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from exact_rooms import room
-from example_results import HOSTILE_NAME, write_example
+from example_results import HOSTILE_NAME, finer_photos, write_example
+from example_sequences import ring
 from freegeo import files
 from freegeo.export.kept import save_kept
-from freegeo.export.reconstruction import METRIC_MODEL, Scale
+from freegeo.export.reconstruction import METRIC_MODEL, Reconstruction, Scale
 from freegeo.fusion.filtering import FilterReport
-from freegeo.report import figures, scene3d
-from freegeo.report.page import flattened, score_table, write_report
+from freegeo.fusion.settings import FilterSettings
+from freegeo.job import write_files
+from freegeo.report import figures, page, scene3d
+from freegeo.report.page import flattened, score_table, views, write_report
 from freegeo.report.result import load_result
 
 
@@ -32,7 +37,8 @@ def scene(tmp_path_factory):
 
 def test_the_page_refers_to_nothing_outside(example):
     without_namespaces = re.sub(r'xmlns(:\w+)?="[^"]*"', "", example)
-    assert not re.search(r"(src|href)\s*=\s*[\"'](?!data:|#)", without_namespaces)
+    links = re.search(r'<section id="files">.*?</section>', without_namespaces, re.DOTALL)[0]
+    assert not re.search(r"(src|href)\s*=\s*[\"'](?!data:|#)", without_namespaces.replace(links, ""))
     assert not re.search(r"https?://|@import|url\((?!#|[\"']?#)", without_namespaces)
     assert "default-src 'none'" in example
     assert len(example) < 1_500_000
@@ -55,6 +61,129 @@ def test_warnings_of_the_summary_stand_at_the_top(tmp_path):
     page = write_report(folder).read_text(encoding="utf-8")
     assert 'class="warnings"' not in plain
     assert page.index("Half of &lt;b&gt;a.png&lt;/b&gt; is cut off.") < page.index("<main>")
+
+
+def test_the_verdict_comes_first(tmp_path):
+    folder = write_example(tmp_path / "out", truth=False)
+    summary = files.read_json(folder / "reconstruction.json")
+    told = {"accepted": False, "reason": "Too few pairs."}
+    files.write_json(folder / "reconstruction.json", {**summary, "warnings": ["A doubt."], "refinement": told})
+    text = write_report(folder).read_text(encoding="utf-8")
+    places = [text.index(part) for part in ("<h1>", "Refinement: no.", "A doubt.", '<dl class="facts">', "<main>")]
+    assert places == sorted(places)
+
+
+def test_without_a_verdict_the_page_says_what_it_shows(tmp_path):
+    room(2).save(tmp_path)
+    for summary, sentence in (
+        ({}, "Nothing is known of how"),
+        ({"adapter": None}, "neither adapted to these photos nor refined"),
+        ({"adapter": "elsewhere/adapter"}, "Predicted with the adapter elsewhere/adapter."),
+    ):
+        assert sentence in page.unasked(dataclasses.replace(load_result(tmp_path), summary=summary))
+
+
+def test_links_name_what_is_there_and_nothing_else(tmp_path):
+    folder = write_example(tmp_path / "out")
+    (folder / "depth").mkdir()
+    text = write_report(folder).read_text(encoding="utf-8")
+    links = re.findall(r'<li><a href="([^"]*)">', text)
+    assert set(links) == {"depth/", "prediction.npz", "frozen/prediction.npz", "adapter/", "reconstruction.json"}
+    assert all((folder / link).exists() for link in links)
+
+
+def test_photos_are_shown_as_the_model_saw_them_but_finer(tmp_path):
+    # A photo of 80 x 120 of which the model read, at an eighth of the size, all rows and the middle, and padding above.
+    photo = np.random.default_rng(0).integers(0, 256, (10, 15, 3), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
+    model = np.full((12, 11, 3), 255, np.uint8)
+    model[2:] = photo[::8, ::8][:, 2:13]
+    seen = dataclasses.replace(
+        room(1, (12, 11)), images=model[None], photo_hw=np.array([[80, 120]]), scale_xy=np.full((1, 2), 1 / 8),
+        offset_xy=np.array([[-2.0, 2.0]]),
+    )  # fmt: skip
+    found = figures.photo_as_seen(photo, seen, 0, 1000)
+    assert found.shape == (96, 88, 3), "no finer than the photo is"
+    assert np.array_equal(found[4::8, 4::8], model)
+    assert max(figures.photo_as_seen(photo, seen, 0, 48).shape) == 48
+    folder = write_example(tmp_path / "out", truth=False)
+    photos = finer_photos(folder)
+    (first, *_) = views(load_result(folder), photos)
+    header = base64.b64decode(first["pictures"][0][2].partition(",")[2])
+    with Image.open(io.BytesIO(header)) as picture:
+        assert picture.size == (640, 480)
+
+
+def test_a_frozen_prediction_beside_known_cameras_is_called_what_it_is(tmp_path):
+    folder = write_example(tmp_path / "out", truth=False)
+    summary = files.read_json(folder / "reconstruction.json")
+    known = {"source": "cameras.json", "poses": 4, "intrinsics": 4, "metric": False}
+    scale = {"value": 2.5, "source": "a measured distance", "spread": None}
+    files.write_json(folder / "reconstruction.json", {**summary, "known_cameras": known, "scale": scale})
+    result = load_result(folder)
+    assert [stage.label for stage in result.predictions] == ["frozen, own cameras", "adapted"]
+    text = write_report(folder).read_text(encoding="utf-8")
+    assert "what differs from it is not the adaptation alone" in text
+    assert "adapted, from frozen, own cameras" in text
+    assert "4 poses, 4 intrinsics, positions times 2.5" in text
+
+
+def test_report_viewer_and_files_have_the_same_points(tmp_path):
+    """With masks and filters of the user's."""
+    trimesh = pytest.importorskip("trimesh")
+    folder = write_example(tmp_path / "out", truth=False, hw=(24, 32))
+    result = Reconstruction.load(folder)
+    masks = np.zeros(result.depth_z.shape, dtype=bool)
+    masks[:, 4:, 3:30] = True
+    write_files(folder, result, ["ply", "glb"], filters=FilterSettings(drop_share=0.1, flying=False), masks=masks)
+    found = load_result(folder)
+    (stage,) = (entry for entry in scene3d.scene_data(found)["stages"] if entry["key"] == "adapted")
+    raw, n = base64.b64decode(stage["points"]), stage["count"]
+    kept = np.frombuffer(raw[17 * n : 18 * n], np.uint8).astype(bool)
+    level = scene3d.level_rotation(found.final.T_cam_world)
+    page = np.frombuffer(raw[: 12 * n], "<f4").reshape(n, 3)[kept] @ level
+    ply = trimesh.load(folder / "points.ply").vertices
+    glb = trimesh.load(folder / "scene.glb", force="scene")
+    (cloud,) = (g for g in glb.geometry.values() if isinstance(g, trimesh.PointCloud))
+    assert 0 < len(ply) < masks.sum() and len(cloud.vertices) == len(ply)
+    # The viewer's points are `Stage.keep`, as tests/report/test_viewer.py checks.
+    for points in (page, found.final.world_points()[found.final.keep]):
+        assert np.allclose(in_order(points), in_order(ply), atol=1e-3)
+
+
+def in_order(points: np.ndarray) -> np.ndarray:
+    return np.sort(np.asarray(points, dtype=np.float64), axis=0)
+
+
+def test_a_line_joins_cameras_only_where_they_follow_each_other(tmp_path):
+    shown = {}
+    for name, order in (("walk", np.arange(12)), ("photos", np.random.default_rng(1).permutation(12))):
+        walk = ring(12, (12, 16))
+        mixed = dataclasses.replace(walk, T_cam_world=walk.T_cam_world[order])
+        mixed.save(tmp_path / name)
+        shown[name] = load_result(tmp_path / name)
+    assert shown["walk"].is_path and not shown["photos"].is_path
+    lines = {name: figures.camera_plan(result).count("stroke-opacity: 0.6") for name, result in shown.items()}
+    texts = {name: "and the line joins them in order" in page.render(result) for name, result in shown.items()}
+    assert texts == {"walk": True, "photos": False}
+    assert lines["walk"] == lines["photos"] + 1
+
+
+def test_labels_of_cameras_do_not_overlap(tmp_path):
+    close = ring(14, (12, 16))
+    T = close.T_cam_world.copy()
+    T[7:, :3, 3] = T[:7, :3, 3] + 0.02  # Seven pairs of cameras, nearly in one place each.
+    T[7:, :3, :3] = T[:7, :3, :3]
+    dataclasses.replace(close, T_cam_world=T).save(tmp_path)
+    drawing = figures.camera_plan(load_result(tmp_path))
+    found = re.findall(
+        r'<text style="font-size: 10px[^"]*fill: var\(--frozen\)"[^>]*(?:translate\(|x=")([-\d.]+)[ "]*(?:y=")?([-\d.]+)[^>]*>(\d+)</text>',
+        drawing,
+    )
+    boxes = [(float(x), float(y), float(x) + 6 * len(text), float(y) + 8) for x, y, text in found]
+    assert {text for _, _, text in found} >= {"1", "8"}
+    for k, a in enumerate(boxes):
+        for b in boxes[:k]:
+            assert a[0] >= b[2] or b[0] >= a[2] or a[1] >= b[3] or b[1] >= a[3]
 
 
 def test_everything_asked_for_is_there(example):

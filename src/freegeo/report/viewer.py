@@ -76,6 +76,8 @@ class Viewer:
         # viser prints its address to stdout, which the command reports itself.
         with redirect_stdout(io.StringIO()), own_pages_only(host):
             self.server = viser.ViserServer(host=host, port=port, label="freegeo", verbose=False)
+        # A column of its own, under which nothing of the scene lies.
+        self.server.gui.configure_theme(control_layout="collapsible")
         self.bands: dict[str, list[Any]] = {}
         self.colours: dict[str, dict[str, list[np.ndarray]]] = {}
         self.frusta: dict[str, list[Any]] = {}
