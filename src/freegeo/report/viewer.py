@@ -77,7 +77,7 @@ class Viewer:
         with redirect_stdout(io.StringIO()), own_pages_only(host):
             self.server = viser.ViserServer(host=host, port=port, label="freegeo", verbose=False)
         # A column of its own, under which nothing of the scene lies.
-        self.server.gui.configure_theme(control_layout="collapsible")
+        self.server.gui.main_panel.dock_right()
         self.bands: dict[str, list[Any]] = {}
         self.colours: dict[str, dict[str, list[np.ndarray]]] = {}
         self.frusta: dict[str, list[Any]] = {}
