@@ -23,10 +23,14 @@ APP_ROOM, APP_PHOTOS = 1, 12
 VIEWER_START_MS, SETTLE_MS, RUN_MS = 15_000, 1_500, 300_000
 
 
-def save(page: Page, name: str) -> None:
-    """Store what the page shows with a palette of 256 colours, which is a third of the size."""
+def save(page: Page, name: str, height: int) -> None:
+    """Store the page down to a height with a palette of 256 colours, which is a third of the size."""
     path = FIGURES / name
-    Image.open(io.BytesIO(page.screenshot())).convert("RGB").quantize(256, kmeans=3).save(path, optimize=True)
+    assert page.viewport_size is not None
+    shown = page.screenshot(
+        full_page=True, clip={"x": 0, "y": 0, "width": page.viewport_size["width"], "height": height}
+    )
+    Image.open(io.BytesIO(shown)).convert("RGB").quantize(256, kmeans=3).save(path, optimize=True)
     print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 
@@ -35,14 +39,14 @@ def main(folder: Path) -> None:
     viewer = open_viewer([folder], port=PORT)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        for name, width, height, scheme in (
-            ("report.png", 1280, 1500, "light"),
-            ("report-phone.png", 390, 844, "dark"),
+        for name, width, window, height, scheme in (
+            ("report.png", 1280, 900, 1850, "light"),
+            ("report-phone.png", 390, 844, 1400, "dark"),
         ):
-            page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
+            page = browser.new_page(viewport={"width": width, "height": window}, color_scheme=scheme)
             page.goto(address)
             page.wait_for_timeout(SETTLE_MS)
-            save(page, name)
+            save(page, name, height)
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.goto(f"http://127.0.0.1:{PORT}")
         page.wait_for_timeout(VIEWER_START_MS)
@@ -50,7 +54,7 @@ def main(folder: Path) -> None:
         if notice.count():
             notice.first.click()
         page.wait_for_timeout(SETTLE_MS)
-        save(page, "viewer.png")
+        save(page, "viewer.png", 800)
         save_app(browser)
         browser.close()
     viewer.close()
@@ -70,7 +74,7 @@ def save_app(browser: Browser) -> None:
         page.frame_locator("#scene3d").locator("#canvas3d").wait_for()
         page.evaluate("scrollTo(0, 0)")
         page.wait_for_timeout(SETTLE_MS)
-        save(page, "app.png")
+        save(page, "app.png", 1150)
         page.close()
 
 
