@@ -2,7 +2,9 @@
 
 import pytest
 
-from freegeo.report.answer import HEADER, LACKING, OVERLAP, answer
+from freegeo.cli.jobs import say_known
+from freegeo.export.reconstruction import METRIC_MODEL
+from freegeo.report.answer import HEADER, LACKING, OVERLAP, answer, rescaled
 
 SCORES = {"epipolar_px": 2.0, "reprojection_px": 3.0, "scale_drift": 0.01, "depth_agreement": 0.9, "matches": 1200}
 WHOLE = {**SCORES, "steps": 1.0, "strength": 1.0, "probability": 0.4, "gain": 0.1, "veto": None}
@@ -122,3 +124,21 @@ def test_a_refused_refinement_changes_nothing_and_says_what_it_lacks(lacking):
 def test_with_known_cameras_the_scores_are_said_to_be_those_of_predicted_ones():
     one = answer(summary(verdict=verdict("adapted", chosen=0), adapter="adapter", known_cameras={"poses": 4}))
     assert one.parts[0].sentence == "Because. These are the cameras that the model sees; the result has the known ones."
+
+
+@pytest.mark.parametrize(
+    ("source", "factor"),
+    [("a measured distance", 2.5), ("the known cameras in cameras.json", None), (METRIC_MODEL, None), (None, None)],
+)
+def test_known_cameras_in_metres_of_another_source_are_not_as_given(source, factor, capsys):
+    known = {
+        "source": "cameras.json", "poses": 3, "intrinsics": 2, "metric": False, "scale": 2.0, "rotation_deg": None,
+        "position": None,
+    }  # fmt: skip
+    scale = None if source is None else {"value": 2.5, "source": source, "spread": None}
+    facts = {"known_cameras": known, "scale": scale}
+    assert rescaled(facts) == factor
+    say_known(facts)
+    said = capsys.readouterr().out
+    assert ("positions times 2.5" in said) == (factor is not None)
+    assert f"depth times {2 * (factor or 1):g}" in said

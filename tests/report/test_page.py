@@ -144,7 +144,10 @@ def test_report_viewer_and_files_have_the_same_points(tmp_path):
     ply = trimesh.load(folder / "points.ply").vertices
     glb = trimesh.load(folder / "scene.glb", force="scene")
     (cloud,) = (g for g in glb.geometry.values() if isinstance(g, trimesh.PointCloud))
-    assert 0 < len(ply) < masks.sum() and len(cloud.vertices) == len(ply)
+    assert 0 < len(ply) < masks.sum()
+    # The GLB file may be turned upright.
+    away = [np.sort(np.linalg.norm(points - points.mean(0), axis=1)) for points in (ply, cloud.vertices)]
+    assert np.allclose(*away, atol=1e-3)
     # The viewer's points are `Stage.keep`, as tests/report/test_viewer.py checks.
     for points in (page, found.final.world_points()[found.final.keep]):
         assert np.allclose(in_order(points), in_order(ply), atol=1e-3)
@@ -163,8 +166,6 @@ def test_a_line_joins_cameras_only_where_they_follow_each_other(tmp_path):
         shown[name] = load_result(tmp_path / name)
     assert shown["walk"].is_path and not shown["photos"].is_path
     lines = {name: figures.camera_plan(result).count("stroke-opacity: 0.6") for name, result in shown.items()}
-    texts = {name: "and the line joins them in order" in page.render(result) for name, result in shown.items()}
-    assert texts == {"walk": True, "photos": False}
     assert lines["walk"] == lines["photos"] + 1
 
 
@@ -269,6 +270,21 @@ def test_the_scene_holds_the_points_it_says(scene):
             assert np.mean(rank[kept] < 50) == pytest.approx(0.5, abs=0.05)
         assert len(entry["cameras"]) == 4
     json.dumps(data)
+
+
+@pytest.mark.parametrize("aspect", [0.6, 1.0, 2.2])
+def test_the_first_view_of_the_viewer_holds_the_points_and_cameras(scene, aspect):
+    result, _ = scene
+    final, fov = result.final, np.deg2rad(50)
+    level, points = scene3d.level_rotation(final.T_cam_world), scene3d.kept_points(final)
+    eye, target = scene3d.first_view(final, level, points.mean(0), frusta=0.1, fov=fov, aspect=aspect)
+    back = (eye - target) / np.linalg.norm(eye - target)
+    right = np.cross(level[1], back) / np.linalg.norm(np.cross(level[1], back))
+    centres = -np.einsum("sij,si->sj", final.T_cam_world[:, :3, :3], final.T_cam_world[:, :3, 3])
+    seen = (np.concatenate((points, centres)) - eye) @ np.stack((right, np.cross(back, right), -back)).T
+    at = np.abs(seen[:, :2] / seen[:, 2:]) / np.tan(fov / 2) / (aspect, 1)
+    assert (seen[:, 2] > 0).all() and (at < 1).all()
+    assert at.max() > 0.9 * scene3d.FILLED
 
 
 def test_the_level_frame_has_the_cameras_up_and_forward():
