@@ -28,6 +28,7 @@ from freegeo.errors import UserError
 from freegeo.export import reconstruction as npz
 from freegeo.export.base import KEPT_NAME, TRACKS_NAME
 from freegeo.export.formats import FORMATS
+from freegeo.export.nerfstudio import DEPTH_FOLDER, MASK_FOLDER
 from freegeo.export.photos import FOLDER as COPIES_FOLDER
 from freegeo.export.photos import write_copies
 from freegeo.files import ledger, read_json
@@ -88,6 +89,8 @@ FILES = {
     KEPT_NAME: "which pixels the filters kept as points",
     "adapter": "the adapter (peft format)",
     **{format.path: format.about for format in FORMATS.values()},
+    DEPTH_FOLDER: "depth for transforms.json, interpolated to the size of the photos",
+    MASK_FOLDER: "masks for transforms.json",
     "chunks": "predictions of the chunks; they may be removed when the result is finished",
     "pieces": "parts of the photos that could not be joined to the result",
     COPIES_FOLDER: "upright copies of the photos (undistorted ones), or the frames of the video that were used",
@@ -142,6 +145,7 @@ def run_job(
     empty = model_options.build_empty()
     process_res = chosen_side(empty.spec, process_res)
     formats = files.all_formats(output, photos, has_cameras=empty.spec.cameras)
+    depth_size = files.size_of_depth(output)
     plan, refining = planned(empty, recipe, refine=refine, pose_from=pose_from, cameras=cameras, placing=placing)
     if plan is not None:
         require_enough_photos(photos)
@@ -160,6 +164,8 @@ def run_job(
         **({} if found.chunks is None else {"joining": {"loops": found.chunks.loops}}),
         "filters": files.filter_settings(found.masks),
         "formats": formats,
+        # Only where it is not the default, so that folders of earlier versions count as finished.
+        **({} if depth_size == "model" else {"depth_size": depth_size}),
     }
     unchecked = None if cameras.trust_cameras else found.known
     state = stored_state(output.output)
@@ -185,9 +191,9 @@ def run_job(
             load=model_options.load, spec=empty.spec, folder=folder, recipe=plan, adapter=adapter, guard=guard,
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), warnings=console.warned(), after=after, formats=formats,
-            filters=files.filters.settings(), checkpoint=model_options.checkpoint_identity, refine=refining,
-            pose_from=pose_from, photos=found.photos, batch=found.batch, masks=found.masks, known=found.known,
-            priors=found.priors, one_camera=found.one_camera, scale=found.scale,
+            depth_size=depth_size, filters=files.filters.settings(), checkpoint=model_options.checkpoint_identity,
+            refine=refining, pose_from=pose_from, photos=found.photos, batch=found.batch, masks=found.masks,
+            known=found.known, priors=found.priors, one_camera=found.one_camera, scale=found.scale,
         )  # fmt: skip
         summary = job.run()
         describe(summary, output.output)
@@ -467,7 +473,11 @@ def describe(summary: dict[str, Any], folder: Path) -> None:
     console.say(f"licence of the weights: {summary['licence_of_weights']}")
     for sentence in summary["warnings"]:
         console.say(f"warning: {sentence}")
-    console.written(folder, FILES)
+    told = dict(FILES)
+    if summary["settings"].get("depth_size") == "photo":
+        depth = [format for format in FORMATS.values() if format.holds_depth]
+        told |= {format.path: f"{format.about}, interpolated to the size of the photos" for format in depth}
+    console.written(folder, told)
 
 
 def say_known(about: dict[str, Any]) -> None:
