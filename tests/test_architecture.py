@@ -52,7 +52,8 @@ ALLOWED = {
 }
 HEAVY = {
     "peft", "scipy", "cv2", "trimesh", "matplotlib", "huggingface_hub", "mcubes", "av", "pycolmap", "viser",
-    "transformers", "jinja2", "ray", "open3d", "pillow_heif", "rerun", "gradio", "fastapi", "starlette", "uvicorn",
+    "transformers", "jinja2", "ray", "open3d", "pillow_heif", "OpenEXR", "rerun", "gradio", "fastapi", "starlette",
+    "uvicorn",
 }  # fmt: skip
 FILES = sorted(PACKAGE.rglob("*.py"))
 

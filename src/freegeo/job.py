@@ -26,7 +26,7 @@ from freegeo.adaptation.samples import SceneImages
 from freegeo.adaptation.state import remove_state
 from freegeo.errors import DivergedError, NoEvidenceError
 from freegeo.evidence.guard import SHARES
-from freegeo.export.base import DEFAULT_FORMATS, TRACKS_NAME, Before
+from freegeo.export.base import DEFAULT_FORMATS, TRACKS_NAME, Before, DepthSize
 from freegeo.export.formats import export, filter_reconstruction
 from freegeo.export.kept import save_kept
 from freegeo.export.measured import load_tracks, save_tracks
@@ -96,9 +96,10 @@ PLACING = Part("placing", (), free=True)
 REFINEMENT = Part("refinement", (TRACKS_NAME,), free=True)
 FILTERS = Part("filters", ("",), free=True)
 FORMATS = Part("formats", (), free=True)
-PARTS = (ADAPTATION, PREDICTION, PLACING, REFINEMENT, FILTERS, FORMATS)
+DEPTH_SIZE = Part("depth_size", (), free=True)
+PARTS = (ADAPTATION, PREDICTION, PLACING, REFINEMENT, FILTERS, FORMATS, DEPTH_SIZE)
 """Parts of a job's settings: photos, model and adapter; how they are used; known and shared cameras, and scale; whether
-bundle adjustment follows; which pixels become points; which files."""
+bundle adjustment follows; which pixels become points; which files; at which size depth is written."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,6 +168,8 @@ class Job:
     """Files to write besides the predictions, names of `freegeo.export.formats.FORMATS`."""
     photos: Sequence[PhotoLike] | None = None
     """The photos of the batch, of which some formats write copies."""
+    depth_size: DepthSize = "model"
+    """Of depth files."""
     filters: FilterSettings = field(default_factory=FilterSettings)
     masks: list[np.ndarray] | None = None
     """One (H, W) array per photo at its size, not zero where points are wanted."""
@@ -449,7 +452,7 @@ class Job:
             masks = None if self.masks is None else masks_for_model(final, self.masks)
             return write_files(
                 self.folder.path, final, self.formats, filters=self.filters, masks=masks, photos=self.photos,
-                before=before, seed=self.seed,
+                before=before, depth_size=self.depth_size, seed=self.seed,
             )  # fmt: skip
 
     def _summary(
@@ -543,6 +546,7 @@ def write_files(
     masks: np.ndarray | None = None,
     photos: Sequence[PhotoLike] | None = None,
     before: Before | None = None,
+    depth_size: DepthSize = "model",
     seed: int = SEED,
 ) -> tuple[FilterReport | None, Mapping[str, str]]:
     """Choose the points of a result and of the predictions before it, and write the result's files.
@@ -555,6 +559,7 @@ def write_files(
         masks: (S, H, W) bool, pixels that the user wants; None: all.
         photos: the photos, of which some formats write copies.
         before: the prediction before adaptation, which the fly-through shows beside the result.
+        depth_size: of depth files.
         seed: of the random choice of points.
 
     Returns:
@@ -577,6 +582,7 @@ def write_files(
         photos=photos,
         tracks=load_tracks(folder, len(result)),
         before=before,
+        depth_size=depth_size,
         seed=seed,
     )
     return None if filtered is None else filtered[1], exported.failed

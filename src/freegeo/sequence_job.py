@@ -31,6 +31,7 @@ from freegeo.files import write_json
 from freegeo.guarded import Evidence
 from freegeo.job import (
     ADAPTATION,
+    DEPTH_SIZE,
     FILES_STAGE,
     FILTERS,
     FORMATS,
@@ -76,6 +77,7 @@ DESCRIPTORS_NAME = f"{CHUNKS_FOLDER}/descriptors.npz"
 JOINING = Part("joining", (PREDICTION_NAME, KEPT_NAME, f"{PIECES_FOLDER}/"), free=True)
 SEQUENCE_PARTS = (
     ADAPTATION, replace(PREDICTION, files=(f"{CHUNKS_FOLDER}/",)), PLACING, REFINEMENT, JOINING, FILTERS, FORMATS,
+    DEPTH_SIZE,
 )  # fmt: skip
 """Parts of the settings of a job with chunks: as `freegeo.job.PARTS`, and how chunks are put together."""
 LOOP_APART, FEWEST_APART = 2, 6
@@ -455,8 +457,9 @@ class SequenceJob(Job):
         with self._timed(f"{label}{FILES_STAGE}", FILTERS):
             wanted = None if self.masks is None else masks_for_model(result, [self.masks[i] for i in frames])
             report, failed = write_files(
-                folder, result, self.formats, filters=self.filters, masks=wanted, photos=photos, seed=self.seed
-            )
+                folder, result, self.formats, filters=self.filters, masks=wanted, photos=photos,
+                depth_size=self.depth_size, seed=self.seed,
+            )  # fmt: skip
         found = Computed(result=result, about=about, adaptation=adaptation)
         # Chunks have the frozen predictions; nobody joined them.
         summary = self._summary(found, report, failed, photos=photos, sequence=told, frozen_prediction=None)

@@ -45,7 +45,7 @@ GIVEN = (
     PhotoOptions(max_views=9, fps=1.5, skip_bad=True, mixed="pad", process_res=756),
     PlacingOptions(one_camera=False, scale="a.jpg:812,410 b.jpg:655,398 = 1.25"),
     FileOptions(
-        formats=("ply", "mesh"),
+        formats=("ply", "mesh"), depth_size="photo",
         filters=FilterOptions(drop_share=0.1, flying=False, multi_view=False, min_agreeing=2, masks=Path("masks")),
     ),
 )  # fmt: skip

@@ -10,9 +10,11 @@ import pytest
 import trimesh
 from PIL import Image
 
-from cli.conftest import PHOTOS
+from cli.conftest import PHOTOS, QUICK
 from cli.test_run import files
+from export.test_photos import stored
 from freegeo import files as writing
+from freegeo.data.procedural import render, sample_rooms
 from freegeo.export.formats import FORMATS
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import LEDGER_FILE, RUN_FILE
@@ -253,6 +255,60 @@ def test_overwrite_leaves_nothing_of_the_result_before(freegeo, photo_folder, ti
     model = pycolmap.Reconstruction(out / "colmap" / "sparse" / "0")
     assert {image.name for image in model.images.values()} == {"new0.png", "new1.png"}
     assert {p.name for p in (out / "colmap" / "images").iterdir()} == {"new0.png", "new1.png"}
+
+
+# -- the size of depth files
+
+
+@pytest.fixture(scope="module")
+def large_photos(tmp_path_factory) -> Path:
+    """Photos larger than what the model reads, one of them turned by its EXIF data."""
+    folder = tmp_path_factory.mktemp("large")
+    images = (render(sample_rooms([7], frames=PHOTOS), 96, 128).images[0].permute(0, 2, 3, 1) * 255).byte().numpy()
+    for k, pixels in enumerate(images):
+        stored(folder / f"{k}.jpg", pixels, 6 if k == 1 else 1)
+    return folder
+
+
+def shapes(folder: Path) -> set[tuple[int, ...]]:
+    return {np.load(file).shape for file in (folder / "depth-npy").glob("*.npy")}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [["reconstruct"], ["run", *QUICK]])
+def test_depth_keeps_the_size_that_a_folder_was_made_with_until_another_is_asked_for(
+    freegeo, large_photos, tiny, tmp_path, command
+):
+    again = [command[0], large_photos, "-o", tmp_path / "out", *tiny, *command[1:]]
+    outcome = freegeo(*again, "--formats", "depth-npy,nerfstudio", "--depth-size", "photo")
+    assert outcome.code == 0
+    assert shapes(tmp_path / "out") == {(96, 128)}
+    assert "depth as NumPy arrays, interpolated to the size of the photos" in outcome.out
+    assert "depth for transforms.json, interpolated to the size of the photos" in outcome.out
+    assert freegeo(*again, "--formats", "kitti").code == 0
+    assert shapes(tmp_path / "out") == {(96, 128)}
+    assert (tmp_path / "out" / "trajectory-kitti.txt").is_file()
+    outcome = freegeo(*again, "--depth-size", "model", "--formats", "depth-npy")
+    assert outcome.code == 0 and "already finished" not in outcome.out
+    assert shapes(tmp_path / "out") == {(48, 64)}
+    assert "already finished" in freegeo(*again, "--formats", "depth-npy").out
+
+
+@pytest.mark.slow
+def test_a_later_export_interpolates_depth_by_the_photos_and_refuses_without_them(
+    freegeo, large_photos, tiny, tmp_path
+):
+    photos, out = shutil.copytree(large_photos, tmp_path / "photos"), tmp_path / "out"
+    assert freegeo("reconstruct", photos, "-o", out, *tiny).code == 0
+    asked = ["export", out, "-f", "depth-npy", "--depth-size", "photo"]
+    outcome = freegeo(*asked)
+    assert outcome.code == 0
+    assert "interpolated from the model's along the edges" in outcome.err
+    assert shapes(out) == {(96, 128)}
+    shutil.rmtree(photos)
+    outcome = freegeo(*asked, "-o", tmp_path / "new")
+    assert outcome.code == 2
+    assert "they are not at hand" in outcome.sentence()
 
 
 # -- photos of a stored result

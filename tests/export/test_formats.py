@@ -1,5 +1,7 @@
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from exact_rooms import PHOTO_SCALE, room
 from freegeo.data.photos import MemoryPhoto
 from freegeo.data.procedural import render, sample_rooms
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.export.depth_png import depth_names, write_depth
+from freegeo.export.depth_files import depth_names
 from freegeo.export.formats import FORMATS, check_formats, chosen_formats, export, filter_reconstruction
 from freegeo.export.mesh import fuse, voxel_size, write_mesh
 from freegeo.export.nerfstudio import opengl_camera_to_world
@@ -41,6 +43,7 @@ def photos_of(scene):
 def test_every_format_is_written_once_and_points_are_shared(tmp_path, short_flights):
     pytest.importorskip("pycolmap", reason="needs the extra colmap")
     pytest.importorskip("rerun", reason="needs the extra rerun")
+    pytest.importorskip("OpenEXR", reason="needs the extra exr")
     scene = room()
     written = export(scene, tmp_path, [*FORMATS, "ply"], max_points=500, max_tracks=100).files
     assert len(set(written)) == len(written)
@@ -54,10 +57,16 @@ def test_every_format_is_written_once_and_points_are_shared(tmp_path, short_flig
 def test_all_stands_for_every_format_and_each_is_where_it_says(tmp_path, short_flights):
     pytest.importorskip("pycolmap", reason="needs the extra colmap")
     pytest.importorskip("rerun", reason="needs the extra rerun")
+    pytest.importorskip("OpenEXR", reason="needs the extra exr")
     written = room().export(str(tmp_path), ["ply", "all"], max_points=100, max_tracks=50).files
     for format in FORMATS.values():
         place = tmp_path / format.path
         assert any(path == place or place in path.parents for path in written), format.name
+
+
+def test_the_page_about_formats_has_a_row_for_each():
+    page = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `([\w-]+)` \|", page, re.MULTILINE) == list(FORMATS)
 
 
 def test_only_formats_without_points_can_do_without_cameras(tmp_path):
@@ -246,10 +255,10 @@ def test_depth_maps_come_back_within_half_a_step(tmp_path):
     depth = room().depth_z.copy()
     depth[0, 0, 0], depth[1, 2, 3] = np.nan, 0.0
     scene = replace(room(), depth_z=depth)
-    write_depth(scene, tmp_path)
-    content = json.loads((tmp_path / "depth.json").read_text())
+    export(scene, tmp_path, ["depth"])
+    content = json.loads((tmp_path / "depth" / "depth.json").read_text())
     for view, name in enumerate(scene.names):
-        with Image.open(tmp_path / content["maps"][name]) as image:
+        with Image.open(tmp_path / "depth" / content["maps"][name]) as image:
             values = np.array(image)
             assert float(image.info["depth_scale"]) == content["scale"]
         assert values.dtype == np.uint16

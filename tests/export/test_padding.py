@@ -11,7 +11,7 @@ from PIL import Image
 import freegeo
 from exact_rooms import PHOTO_SCALE, room
 from freegeo.data.photos import MemoryPhoto
-from freegeo.export.formats import FORMATS, export, filter_reconstruction
+from freegeo.export.formats import export, filter_reconstruction
 from freegeo.export.mesh import fuse, voxel_size
 from freegeo.export.pixels import corner_pixels, masks_for_model
 from freegeo.export.reconstruction import Reconstruction
@@ -89,7 +89,7 @@ def test_a_view_is_not_asked_about_what_falls_into_its_padding():
 def test_no_format_holds_a_point_or_a_colour_of_padding(tmp_path):
     pytest.importorskip("pycolmap", reason="needs the extra colmap")
     scene, inside = padded()
-    export(scene, tmp_path, list(FORMATS), filtered=filter_reconstruction(scene, settings=EVERYTHING))
+    export(scene, tmp_path, ["all"], filtered=filter_reconstruction(scene, settings=EVERYTHING))
     points = trimesh.load(tmp_path / "points.ply")
     assert len(points.vertices) == inside.sum()
     clouds = (points.colors, trimesh.load(tmp_path / "scene.glb").geometry["points"].colors)

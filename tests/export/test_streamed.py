@@ -173,7 +173,8 @@ from pathlib import Path
 from freegeo.export.formats import export, filter_reconstruction
 from freegeo.export.reconstruction import Reconstruction
 scene = Reconstruction.load(Path(sys.argv[1]))
-export(scene, sys.argv[2], ["ply", "glb", "depth", "tum"], filtered=filter_reconstruction(scene), max_points=1000)
+formats = ["ply", "glb", "depth", "depth-npy", "tum", "kitti"]
+export(scene, sys.argv[2], formats, filtered=filter_reconstruction(scene), max_points=1000)
 status = Path("/proc/self/status").read_text()
 print(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM:")))
 """

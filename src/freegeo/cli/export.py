@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from freegeo.cli import console
 from freegeo.cli.files import FORMAT_NAMES, FilterOptions, require_complete
 from freegeo.errors import UserError
-from freegeo.export.base import MAX_TRACKS
+from freegeo.export.base import MAX_TRACKS, DepthSize
 from freegeo.fusion.settings import MAX_POINTS
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ def export(
     max_points: int = MAX_POINTS,
     max_tracks: int = MAX_TRACKS,
     voxel: float | None = None,
+    depth_size: DepthSize = "model",
     filters: FilterOptions | None = None,
 ) -> None:
     """Write a reconstruction in other formats.
@@ -49,6 +50,8 @@ def export(
         Most points of the COLMAP model.
     voxel
         Voxel edge of the mesh, in the reconstruction's units; default: from its resolution.
+    depth_size
+        Size of depth files: model, that of the model's images, or photo, interpolated from it along the photos' edges.
     """
     from freegeo.export import formats
     from freegeo.export.kept import load_kept, load_masks
@@ -92,6 +95,7 @@ def export(
                 reconstruction, target, names, filtered=filtered, masks=masks,
                 photos=find_photos(reconstruction, run or home), max_points=max_points, max_tracks=max_tracks,
                 voxel=voxel, tracks=load_tracks(home, len(reconstruction)), before=before,
+                depth_size=depth_size,
             ).require_any()  # fmt: skip
     for file in result.files:
         console.say(f"  {file}  {console.size(file)}")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from freegeo.errors import PartialResultError
-from freegeo.export.base import DEFAULT_FORMATS, FLAT_FORMATS
+from freegeo.export.base import DEFAULT_FORMATS, FLAT_FORMATS, DepthSize
 from freegeo.export.formats import ALL, FORMATS, check_formats, chosen_formats
 from freegeo.fusion.settings import FilterSettings
 from freegeo.run_folder import stored_state
@@ -88,6 +88,9 @@ class FileOptions:
 
     formats: Annotated[tuple[str, ...] | None, FORMAT_NAMES] = None
     """Default: ply glb, or depth for a model without cameras."""
+    depth_size: DepthSize | None = None
+    """Size of depth files: model, that of the model's images, or photo, interpolated from it along the photos' edges.
+    Default: as in the folder of an earlier run, else model."""
     filters: FilterOptions = FilterOptions()
 
     def filter_settings(self, masks: Sequence[np.ndarray] | None) -> dict[str, object]:
@@ -95,6 +98,11 @@ class FileOptions:
         values = asdict(self.filters)
         del values["masks"]
         return {**values, "masks": None if masks is None else _digest(masks)}
+
+    def size_of_depth(self, output: OutputOptions) -> DepthSize:
+        """Return the size asked for, or else that of the depth files in the folder, unless it is overwritten."""
+        before = None if output.overwrite else stored_state(output.output)
+        return self.depth_size or (before or {"settings": {}})["settings"].get("depth_size", "model")
 
     def all_formats(self, output: OutputOptions, photos: Sequence[PhotoLike], *, has_cameras: bool) -> list[str]:
         """Return the formats asked for, and those that the folder has already, unless it is overwritten.

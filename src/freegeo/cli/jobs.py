@@ -30,7 +30,7 @@ from freegeo.export.photos import write_copies
 from freegeo.files import ledger, read_json
 from freegeo.models.spec import MIXED, Mixed, PoseFrom
 from freegeo.progress import step_bar
-from freegeo.report.contents import FILES
+from freegeo.report.contents import contents
 from freegeo.run_folder import check_folder, run_folder, stored_state
 
 if TYPE_CHECKING:
@@ -125,6 +125,7 @@ def run_job(
     empty = model_options.build_empty()
     process_res = chosen_side(empty.spec, process_res)
     formats = files.all_formats(output, photos, has_cameras=empty.spec.cameras)
+    depth_size = files.size_of_depth(output)
     plan, refining = planned(empty, recipe, refine=refine, pose_from=pose_from, cameras=cameras, placing=placing)
     if plan is not None:
         require_enough_photos(photos)
@@ -143,6 +144,8 @@ def run_job(
         **({} if found.chunks is None else {"joining": {"loops": found.chunks.loops}}),
         "filters": files.filter_settings(found.masks),
         "formats": formats,
+        # Only where it is not the default, so that folders of earlier versions count as finished.
+        **({} if depth_size == "model" else {"depth_size": depth_size}),
     }
     unchecked = None if cameras.trust_cameras else found.known
     state = stored_state(output.output)
@@ -168,9 +171,9 @@ def run_job(
             load=model_options.load, spec=empty.spec, folder=folder, recipe=plan, adapter=adapter, guard=guard,
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), warnings=console.warned(), after=after, formats=formats,
-            filters=files.filters.settings(), checkpoint=model_options.checkpoint_identity, refine=refining,
-            pose_from=pose_from, photos=found.photos, batch=found.batch, masks=found.masks, known=found.known,
-            priors=found.priors, one_camera=found.one_camera, scale=found.scale,
+            depth_size=depth_size, filters=files.filters.settings(), checkpoint=model_options.checkpoint_identity,
+            refine=refining, pose_from=pose_from, photos=found.photos, batch=found.batch, masks=found.masks,
+            known=found.known, priors=found.priors, one_camera=found.one_camera, scale=found.scale,
         )  # fmt: skip
         summary = job.run()
         describe(summary, output.output)
@@ -450,7 +453,7 @@ def describe(summary: dict[str, Any], folder: Path) -> None:
     console.say(f"licence of the weights: {summary['licence_of_weights']}")
     for sentence in summary["warnings"]:
         console.say(f"warning: {sentence}")
-    console.written(folder, FILES)
+    console.written(folder, contents(depth_size=summary["settings"].get("depth_size")))
 
 
 def say_known(summary: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from freegeo.errors import FreeGeoError
 
@@ -34,6 +34,8 @@ TRACKS_NAME = "tracks.npz"
 """File of points that were measured in the photos (`freegeo.export.measured`)."""
 MAX_TRACKS = 100_000
 """Default limit of the points of a COLMAP model."""
+DepthSize = Literal["model", "photo"]
+"""Size of depth files: of the model's images, or of the photos, by interpolation (`freegeo.export.upsampling`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +50,8 @@ class Format:
     write: Callable[[Export], list[Path]]
     """Writes the files and returns their paths; FreeGeoError when there is nothing to write."""
     needs_cameras: bool = True
+    holds_depth: bool = False
+    """Whether it consists of depth maps, whose size can be chosen."""
     check: Callable[[Sequence[str]], None] = lambda names: None
     """Raises UserError when photos of these names cannot be written in this format, whatever a model predicts."""
 
@@ -104,6 +108,8 @@ class Export:
     before: Before | None
     """None: there is no earlier prediction."""
     seed: int
+    depth_size: DepthSize = "model"
+    """Size of depth files; `photo` needs the photos."""
     written: dict[str, list[Path]] = field(default_factory=dict)
     """Files by the name of the format."""
     copies: list[Path] = field(default_factory=list)

@@ -1,6 +1,6 @@
 """The export formats, and the one function that writes any of them.
 
-A new format is a module beside this one that declares its `FORMAT`, and an entry in `FORMATS`. Help texts, checks and
+A new format is a `Format` in a module beside this one, and an entry in `FORMATS`. Help texts, checks and
 lists of written files follow from that.
 """
 
@@ -15,9 +15,9 @@ import numpy as np
 
 from freegeo import files
 from freegeo.errors import FreeGeoError, LostFolderError, UserError
-from freegeo.export import colmap, depth_png, glb, mesh, nerfstudio, ply, rerun, tum, video
+from freegeo.export import colmap, depth_files, glb, kitti, mesh, nerfstudio, ply, rerun, tum, video
 from freegeo.export import reconstruction as npz
-from freegeo.export.base import MAX_TRACKS, Before, Export, Exported, Format
+from freegeo.export.base import MAX_TRACKS, Before, DepthSize, Export, Exported, Format
 from freegeo.fusion.settings import MAX_POINTS, FilterSettings
 
 if TYPE_CHECKING:
@@ -28,8 +28,13 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_MODULES = (npz, ply, glb, mesh, colmap, nerfstudio, tum, depth_png, video, rerun)
-FORMATS: dict[str, Format] = {module.FORMAT.name: module.FORMAT for module in _MODULES}
+FORMATS: dict[str, Format] = {
+    format.name: format
+    for format in (
+        npz.FORMAT, ply.FORMAT, glb.FORMAT, mesh.FORMAT, colmap.FORMAT, nerfstudio.FORMAT, tum.FORMAT, kitti.FORMAT,
+        depth_files.PNG, depth_files.PICTURES, depth_files.NPY, depth_files.EXR, video.FORMAT, rerun.FORMAT,
+    )
+}  # fmt: skip
 ALL = "all"
 """Name that selects every format."""
 NO_CAMERAS = "this reconstruction has no cameras, so it has no 3D points. Use a model that predicts cameras."
@@ -100,6 +105,7 @@ def export(
     voxel: float | None = None,
     tracks: Tracks | None = None,
     before: Before | None = None,
+    depth_size: DepthSize = "model",
     seed: int = 0,
 ) -> Exported:
     """Write a reconstruction in several formats; one that has nothing to write is a warning and costs no other.
@@ -119,16 +125,23 @@ def export(
         voxel: voxel edge of the mesh in the reconstruction's units; default chosen from its resolution.
         tracks: points that were measured in the photos, for the COLMAP model; None: it gets projected ones.
         before: an earlier prediction of the same views, which the fly-through shows beside this one.
+        depth_size: of depth files: the model's, or the photos' by interpolation, which needs the photos.
         seed: of the random choice of points.
 
     Raises:
         UserError: a format that is unknown or can never be written (`check_formats`), a voxel or limit that is not
-            positive, other photos than the reconstruction's, or a folder that cannot be written to.
+            positive, other photos than the reconstruction's, none where depth is to have their size, or a folder that
+            cannot be written to.
     """
     from freegeo.fusion.agreement import TOLERANCE_RANGE
 
     wanted = [FORMATS[name] for name in check_formats(formats, reconstruction.names)]
     _check_values(reconstruction, photos, max_points=max_points, max_tracks=max_tracks, voxel=voxel)
+    if depth_size == "photo" and photos is None and any(format.holds_depth for format in wanted):
+        raise UserError(
+            "Depth at the size of the photos is interpolated by these, and they are not at hand: not given, moved or "
+            "changed. Put them back where they were, or take depth at the model's size."
+        )
     report = None
     keep = np.ones(reconstruction.depth_z.shape, dtype=bool) if masks is None else masks
     if reconstruction.has_cameras and any(format.needs_cameras for format in wanted):
@@ -149,6 +162,7 @@ def export(
         photos=photos,
         tracks=tracks,
         before=before,
+        depth_size=depth_size,
         seed=seed,
     )
     written: list[Path] = []

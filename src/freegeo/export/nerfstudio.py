@@ -3,11 +3,17 @@
 The photos that it refers to are the upright copies in ``images/`` (`freegeo.export.photos`). World coordinates stay
 those of the reconstruction (and of `points.ply`, which the file names); only the cameras' axes change: x right, y up,
 z backward. Pixel centres are at 0.5.
+
+Depth lies in ``nerfstudio-depth/`` at the photos' size (`freegeo.export.upsampling`), of the pixels that became points,
+0 elsewhere. nerfstudio multiplies it by 0.001 unless it is told otherwise, so that it is stored in thousandths of the
+cameras' unit, as float32: 16-bit integers would be too coarse for lengths that are up to scale. The user's masks, if
+there are any, lie in ``masks/`` at the photos' size; white is used. Either is given for all photos or for none.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +22,17 @@ from freegeo import files
 from freegeo.errors import FreeGeoError
 from freegeo.export import photos, ply
 from freegeo.export.base import Export, Format
-from freegeo.export.pixels import corner_K
+from freegeo.export.depth_files import depth_names, photo_depth
+from freegeo.export.pixels import corner_K, mask_for_photo
 from freegeo.export.reconstruction import Reconstruction
 
 logger = logging.getLogger(__name__)
 
 FILE_NAME = "transforms.json"
+DEPTH_FOLDER = "nerfstudio-depth"
+MASK_FOLDER = "masks"
+DEPTH_UNIT = 0.001
+"""What nerfstudio multiplies depth by, by default (`depth_unit_scale_factor`)."""
 
 
 def opengl_camera_to_world(T_cam_world: np.ndarray) -> np.ndarray:
@@ -30,13 +41,20 @@ def opengl_camera_to_world(T_cam_world: np.ndarray) -> np.ndarray:
     return np.linalg.inv(T) @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def write_nerfstudio(reconstruction: Reconstruction, path: Path, *, points: str | None = None) -> Path:
+def write_nerfstudio(
+    reconstruction: Reconstruction,
+    path: Path,
+    *,
+    points: str | None = None,
+    maps: Mapping[str, Sequence[Path]] | None = None,
+) -> Path:
     """Write the cameras.
 
     Args:
         reconstruction: with cameras.
         path: of the JSON file; the copies of the photos are expected in `images/` beside it.
         points: name of a point cloud beside the file.
+        maps: files in folders beside it, one per view, under the key that a frame names them by.
     """
     K = corner_K(reconstruction)
     matrices = opengl_camera_to_world(reconstruction.cameras()[0])
@@ -50,13 +68,46 @@ def write_nerfstudio(reconstruction: Reconstruction, path: Path, *, points: str 
             "cx": K[view, 0, 2],
             "cy": K[view, 1, 2],
             "transform_matrix": matrices[view].tolist(),
+            **{key: paths[view].relative_to(path.parent).as_posix() for key, paths in (maps or {}).items()},
         }
         for view, name in enumerate(photos.copy_names(reconstruction.names))
     ]
     distortion = {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
     cloud = {"ply_file_path": points} if points else {}
-    files.write_json(path, {"camera_model": "OPENCV", **distortion, **cloud, "frames": frames})
+    unit = {"depth_unit_scale_factor": DEPTH_UNIT} if maps and "depth_file_path" in maps else {}
+    files.write_json(path, {"camera_model": "OPENCV", **distortion, **cloud, **unit, "frames": frames})
     return path
+
+
+def _write_depth(export: Export) -> list[Path]:
+    """Write the depth of the kept pixels at the photos' size; nothing where there are none, or no photos."""
+    folder, written = export.folder / DEPTH_FOLDER, []
+    if export.photos is not None and export.keep.any():
+        names, valid = export.reconstruction.names, export.reconstruction.valid_pixels() & export.keep
+        for view, name in enumerate(depth_names(names, ".npy")):
+            path = files.inside(folder, name)
+            depth = photo_depth(export, view, valid[view]) / np.float32(DEPTH_UNIT)
+            with files.atomic_path(path) as part, part.open("wb") as file:
+                np.save(file, depth)
+            written.append(path)
+    files.remove_written(folder, keep=written)
+    return written
+
+
+def _write_masks(export: Export) -> list[Path]:
+    """Write the user's masks at the photos' size, black where the model did not see them; nothing without masks."""
+    from PIL import Image
+
+    folder, written = export.folder / MASK_FOLDER, []
+    if export.masks is not None:
+        for view, name in enumerate(depth_names(export.reconstruction.names)):
+            path = files.inside(folder, name)
+            mask = mask_for_photo(export.reconstruction, view, export.masks[view])
+            with files.atomic_path(path) as part:
+                Image.fromarray(np.where(mask, np.uint8(255), np.uint8(0))).save(part, compress_level=1)
+            written.append(path)
+    files.remove_written(folder, keep=written)
+    return written
 
 
 def _write(export: Export) -> list[Path]:
@@ -64,10 +115,15 @@ def _write(export: Export) -> list[Path]:
     try:
         points = export.write(ply.FORMAT)
     except FreeGeoError as error:
-        logger.warning("%s has no initial points: %s", FILE_NAME, error)
+        logger.warning("%s has neither initial points nor depth: %s", FILE_NAME, error)
         points = []
+    if export.photos is None and points:
+        logger.warning("%s has no depth: that is interpolated to the size of the photos by these.", FILE_NAME)
+    written = {"depth_file_path": _write_depth(export), "mask_path": _write_masks(export)}
+    maps = {key: paths for key, paths in written.items() if paths}
     name = points[0].name if points else None
-    return [write_nerfstudio(export.reconstruction, export.folder / FILE_NAME, points=name), *points, *copies]
+    path = write_nerfstudio(export.reconstruction, export.folder / FILE_NAME, points=name, maps=maps)
+    return [path, *points, *copies, *(file for paths in maps.values() for file in paths)]
 
 
 FORMAT = Format(

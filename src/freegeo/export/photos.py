@@ -71,9 +71,9 @@ def write_copies(photos: Sequence[PhotoLike], folder: Path) -> list[Path]:
             if stored is not None:
                 part.write_bytes(stored)
             elif path.suffix.lower() == ".png":
-                Image.fromarray(_pixels(photo)).save(part, compress_level=1)
+                Image.fromarray(pixels_of(photo)).save(part, compress_level=1)
             else:
-                Image.fromarray(_pixels(photo)).save(part, quality=JPEG_QUALITY, subsampling=0)
+                Image.fromarray(pixels_of(photo)).save(part, quality=JPEG_QUALITY, subsampling=0)
         paths.append(path)
     return paths
 
@@ -95,7 +95,8 @@ def _readable_as_stored(photo: PhotoLike, suffix: str) -> bytes | None:
     return content if upright and plain and as_named else None
 
 
-def _pixels(photo: PhotoLike) -> np.ndarray:
+def pixels_of(photo: PhotoLike) -> np.ndarray:
+    """Return the upright pixels (H, W, 3) uint8 of a photo; FreeGeoError when it can no longer be read."""
     try:
         return photo.read()
     except UserError as error:

@@ -31,6 +31,35 @@ def corner_K(reconstruction: Reconstruction) -> np.ndarray:
     return photo_K(*map(torch.from_numpy, values)).numpy()
 
 
+def map_places(count: int, side: int, scale: float, offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the pixels of a photo are in a map of the model, along one axis.
+
+    Args:
+        count: pixels of the photo.
+        side: pixels of the map.
+        scale: from the photo to the map.
+        offset: of the map.
+
+    Returns:
+        (count,) float64 places, where the centres of the map's pixels are at whole numbers; (count,) int64 the map's
+        pixel that each falls into, the nearest one for those outside; (count,) bool whether it falls into one.
+    """
+    corner = (np.arange(count) + HALF) * scale + offset
+    return corner - HALF, np.clip(np.floor(corner), 0, side - 1).astype(np.int64), (corner >= 0) & (corner < side)
+
+
+def mask_for_photo(reconstruction: Reconstruction, view: int, mask: np.ndarray) -> np.ndarray:
+    """Turn a mask (H, W) bool of a view's map into one (h, w) of its photo; false where the model did not see it."""
+    (row, row_seen), (column, column_seen) = (
+        map_places(
+            int(reconstruction.photo_hw[view, axis]), mask.shape[axis], reconstruction.scale_xy[view, 1 - axis],
+            reconstruction.offset_xy[view, 1 - axis],
+        )[1:]
+        for axis in (0, 1)
+    )  # fmt: skip
+    return mask[row[:, None], column] & row_seen[:, None] & column_seen
+
+
 def masks_for_model(reconstruction: Reconstruction, masks: list[np.ndarray]) -> np.ndarray:
     """Turn a user's masks into one (S, H, W) bool for the model's maps, true where points are wanted.
 

@@ -31,7 +31,7 @@ import numpy as np
 
 from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.export.base import DEFAULT_FORMATS, MAX_TRACKS, Export, Exported, Format
+from freegeo.export.base import DEFAULT_FORMATS, MAX_TRACKS, DepthSize, Export, Exported, Format
 from freegeo.fusion.settings import MAX_POINTS, FilterSettings
 
 if TYPE_CHECKING:
@@ -275,6 +275,7 @@ class Reconstruction:
         max_points: int | None = MAX_POINTS,
         max_tracks: int | None = MAX_TRACKS,
         voxel: float | None = None,
+        depth_size: DepthSize = "model",
         seed: int = 0,
     ) -> Exported:
         """Write files for other tools, and return which, and which formats could not be written.
@@ -287,14 +288,17 @@ class Reconstruction:
             formats: names of `freegeo.export.formats.FORMATS`; `all` stands for all that can be written.
             filters: which points are kept; None: the defaults of `FilterSettings`.
             masks: one (H, W) array per photo at its size, not zero where points are wanted.
-            photos: the photos of this reconstruction, of which `colmap` and `nerfstudio` write upright copies.
+            photos: the photos of this reconstruction, of which `colmap` and `nerfstudio` write upright copies, and by
+                which depth is interpolated to their size.
             max_points: of `points.ply` and `scene.glb`; None writes all.
             max_tracks: points of the COLMAP model; None writes all.
             voxel: voxel edge of the mesh in the reconstruction's units; None: from its resolution.
+            depth_size: of depth files: the model's, or the photos' by interpolation, which needs the photos.
             seed: of the random choice of points.
 
         Raises:
-            UserError: a format that is unknown or can never be written: a missing extra, no cameras, one photo.
+            UserError: a format that is unknown or can never be written: a missing extra, no cameras, one photo; no
+                photos for depth at their size.
             FreeGeoError: nothing at all is left to write.
         """
         from freegeo.export.formats import check_formats, export, filter_reconstruction
@@ -305,7 +309,7 @@ class Reconstruction:
         filtered = filter_reconstruction(self, masks=wanted, settings=filters) if self.has_cameras else None
         return export(
             self, Path(folder).expanduser(), names, filtered=filtered, masks=wanted, photos=photos,
-            max_points=max_points, max_tracks=max_tracks, voxel=voxel, seed=seed,
+            max_points=max_points, max_tracks=max_tracks, voxel=voxel, depth_size=depth_size, seed=seed,
         ).require_any()  # fmt: skip
 
     @classmethod

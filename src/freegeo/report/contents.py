@@ -5,11 +5,14 @@ from __future__ import annotations
 from freegeo.export import reconstruction as npz
 from freegeo.export.base import KEPT_NAME, TRACKS_NAME
 from freegeo.export.formats import FORMATS
+from freegeo.export.nerfstudio import DEPTH_FOLDER, MASK_FOLDER
 from freegeo.export.photos import FOLDER as COPIES_FOLDER
 
 FILES = {
     "report.html": "the page to look at first",
     **{format.path: format.about for format in FORMATS.values() if format is not npz.FORMAT},
+    DEPTH_FOLDER: "depth for transforms.json, interpolated to the size of the photos",
+    MASK_FOLDER: "masks for transforms.json",
     COPIES_FOLDER: "upright copies of the photos (undistorted ones), or the frames of the video that were used",
     npz.FORMAT.path: npz.FORMAT.about,
     "frozen/prediction.npz": "the same before adaptation",
@@ -23,3 +26,11 @@ FILES = {
     "pieces": "parts of the photos that could not be joined to the result",
     "reconstruction.json": "settings, timings, versions, licence of the weights",
 }
+
+
+def contents(*, depth_size: str | None = None) -> dict[str, str]:
+    """Return file -> what it is for, where depth files have the given size ("photo": that of the photos)."""
+    if depth_size != "photo":
+        return FILES
+    depth = [format for format in FORMATS.values() if format.holds_depth]
+    return FILES | {format.path: f"{format.about}, interpolated to the size of the photos" for format in depth}
