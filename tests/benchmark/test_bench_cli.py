@@ -68,6 +68,7 @@ def test_check_names_the_scenes_that_are_not_there():
     assert check_dataset(BENCH, DATASET).complete
 
 
+@pytest.mark.slow
 def test_a_run_prints_and_stores_its_tables_and_a_second_one_does_nothing_again(freegeo, options, tmp_path):
     code, out, err = freegeo("run", "main", *options)
     assert code in (0, 1), err  # an empty surface of random weights is reported

@@ -305,6 +305,7 @@ def test_chunks_that_are_too_small_to_adapt_to_are_refused_at_once(freegeo, walk
     assert not oracle.asked
 
 
+@pytest.mark.slow
 def test_auto_keeps_the_chunks_of_an_earlier_run(freegeo, walk, tiny, tmp_path, oracle):
     """What fits into memory may have changed since."""
     out, auto = tmp_path / "out", ["--chunk", "auto", "--overlap", OVERLAP, "--order", "given"]

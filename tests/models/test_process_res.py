@@ -139,6 +139,7 @@ def test_rounding_is_said(caplog):
     assert "--process-res 43 is rounded to patches of 8: images are 40 x 32." in caplog.text
 
 
+@pytest.mark.slow
 def test_an_adapter_says_at_which_side_it_was_trained(tmp_path, caplog):
     model, found = sized(), photos(*FOUR)
     result = freegeo.adapt(model, found, process_res=48, device="cpu", **QUICK)

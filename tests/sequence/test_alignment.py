@@ -84,7 +84,7 @@ def points_of(chunk, rows):
     return torch.from_numpy(np.concatenate(points)), torch.from_numpy(np.concatenate(depths))
 
 
-@pytest.mark.parametrize("fixed_scale", [False, True])
+@pytest.mark.parametrize("fixed_scale", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_equals_a_general_solver_of_the_same_problem(fixed_scale):
     move = Sim3.exp(MOVE.log() * torch.tensor([1, 1, 1, 1, 1, 1, 0.0])) if fixed_scale else MOVE
     first = chunk([0, 1, 2, 3], noise=0.03, outliers=0.1)

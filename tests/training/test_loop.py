@@ -96,6 +96,7 @@ def test_a_larger_budget_goes_on_from_the_plateau(tmp_path, small_config, whole_
     assert steps[-1][1] >= 60
 
 
+@pytest.mark.slow
 def test_a_run_continues_another_one_with_rooms_and_rates_of_its_own(tmp_path, small_config, whole_run):
     before = torch.load(whole_run.parent / state.NEWEST_FILE, weights_only=True)["counters"].tolist()
     config = replace(small_config, views=60, first_room=6, peak=0.25, cooldown=1.0)
