@@ -91,10 +91,11 @@ def describe(model: str) -> None:
         fast, small = map(gigabytes, needs.adapt)
         console.say(f"memory to adapt to {ADAPTED_VIEWS} of them: {fast}, or {small} where that does not fit")
     console.say(f"images: longest side {spec.default_side}, patches of {spec.patch_size}")
+    console.say(f"takes: {TAKES[spec.takes] if spec.cameras else 'photos, one by one'}")
+    console.say(f"gives: depth and its confidence{', poses and intrinsics' if spec.cameras else ''}")
     console.say(f"lengths: {'metres' if spec.metric else 'up to scale'}")
-    console.say(f"takes: {TAKES[spec.takes]}")
-    if spec.caution:
-        console.say(spec.caution)
+    for sentence in filter(None, (spec.caution, spec.adaptation.caution)):
+        console.say(sentence)
     if built.cross_view is None:
         console.say("adapter: none, since it looks at each photo by itself")
         return
