@@ -118,7 +118,7 @@ def _entry(name: str, about: str, config: Pi3Config, hub_id: str, parameters: in
         adaptation=AdaptationDefaults(
             temperature=0.7,
             scene_lr=1e-5,
-            caution=f"An independent test found {name} worse after adapting it as published (AUC@3 by 7.1 %, F1 by "
+            caution="An independent test found Pi3 worse after adapting it as published (AUC@3 by 7.1 %, F1 by "
             "9.3 %), and the settings used here instead are unproven; trust the verdict of --guard select.",
         ),
         metric=config.x is not None,
