@@ -1,29 +1,25 @@
 """`bench download`: sizes and terms first, a stopped download continues, archives are compared and unpacked safely."""
 
 import errno
-import hashlib
 import io
 import logging
 import re
 import shutil
 import stat
-import threading
 import zipfile
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import huggingface_hub
 import pytest
 from huggingface_hub import constants, file_download
 
+from fake_hub import CLOSED, COMMIT, ENVIRONMENT, running, use_endpoint
 from fixture_tools import fixture_path
 from freegeo.benchmark import download
 from freegeo.cli.app import main
 from freegeo.data.datasets import eth3d
 
 DATASETS = fixture_path("benchmark", "datasets")
-COMMIT = "0123456789" * 4
-CLOSED = "http://127.0.0.1:9"
 
 
 def zipped(entries: dict[str, bytes]) -> bytes:
@@ -42,75 +38,24 @@ PIPES = {f"eth3d/{name}": content for name, content in files_below(Path(DATASETS
 ARCHIVE = zipped(PIPES)
 
 
-class Hub:
-    """A hub with one archive: how it answers, after how many bytes it hangs up, and what it was asked for."""
-
-    def __init__(self):
-        self.reset()
-        ours = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def answer(self, *, with_content: bool) -> None:
-                start = int((self.headers.get("Range") or "bytes=0-")[6:].partition("-")[0])
-                ours.asked.append(f"{self.command} {self.path} {start}")
-                start = start if ours.takes_ranges else 0
-                self.send_response(ours.status if ours.status != 200 or not start else 206)
-                self.send_header("X-Repo-Commit", COMMIT)
-                if ours.error:
-                    self.send_header("X-Error-Code", ours.error)
-                self.send_header("ETag", f'"{ours.tag or hashlib.sha256(ours.content).hexdigest()}"')
-                self.send_header("Content-Length", str(len(ours.content) - start))
-                if start:
-                    self.send_header("Content-Range", f"bytes {start}-{len(ours.content) - 1}/{len(ours.content)}")
-                self.end_headers()
-                if with_content:
-                    self.wfile.write(ours.content[start : ours.hangs_up_after])
-
-            def do_HEAD(self):
-                self.answer(with_content=False)
-
-            def do_GET(self):
-                self.answer(with_content=True)
-
-            def log_message(self, *arguments):
-                pass
-
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self.server.server_port}"
-
-    def reset(self):
-        self.content, self.status, self.error, self.tag, self.asked = ARCHIVE, 200, "", None, []
-        self.hangs_up_after, self.takes_ranges = None, True
-
-
 @pytest.fixture(scope="module")
 def running_hub():
-    hub = Hub()
-    thread = threading.Thread(target=hub.server.serve_forever, args=(0.01,))
-    thread.start()
-    yield hub
-    hub.server.shutdown()
-    thread.join()
-    hub.server.server_close()
+    with running(ARCHIVE) as hub:
+        yield hub
 
 
 @pytest.fixture
 def hub(monkeypatch, tmp_path, running_hub):
-    for name in ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "HF_TOKEN", "http_proxy", "https_proxy", "all_proxy"):
+    for name in ENVIRONMENT:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
     monkeypatch.setattr(constants, "HF_TOKEN_PATH", str(tmp_path / "token"))
     monkeypatch.setattr(eth3d, "SCENES", ("pipes",))
-    running_hub.reset()
+    running_hub.reset(ARCHIVE)
     use_endpoint(monkeypatch, running_hub.url)
     huggingface_hub.close_session()
     yield running_hub
     huggingface_hub.close_session()
-
-
-def use_endpoint(monkeypatch, url: str) -> None:
-    monkeypatch.setattr(constants, "ENDPOINT", url)
-    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", url + "/{repo_id}/resolve/{revision}/{filename}")
 
 
 @pytest.fixture
@@ -173,21 +118,21 @@ def test_a_download_that_broke_off_continues_where_it_was(get, hub, monkeypatch,
     monkeypatch.setattr(logging, "raiseExceptions", False)  # the client's logger writes to the stream of another test
     monkeypatch.setattr(file_download.time, "sleep", lambda seconds: None)
     monkeypatch.setattr(constants, "DOWNLOAD_CHUNK_SIZE", 1000)
-    half, hub.takes_ranges = len(ARCHIVE) // 2000 * 1000, takes_ranges
-    hub.hangs_up_after = half
+    half = len(ARCHIVE) // 2000 * 1000
+    hub.breaks_off_at = half
     code, _, said = get("eth3d")
     assert code == 2
     assert "eth3d.zip could not be downloaded: " in said
     assert "run the same command again, which continues" in said
     assert not (tmp_path / "data" / "eth3d.zip").exists()
-    (part,) = (tmp_path / "data").glob("eth3d.zip.*.part")
+    (part,) = (tmp_path / "data").glob("eth3d.zip.*.incomplete")
     assert part.read_bytes() == ARCHIVE[:half]
-    hub.hangs_up_after = None
-    hub.asked.clear()
+    hub.breaks_off_at, hub.takes_ranges = None, takes_ranges
+    hub.starts.clear()
     code, out, _ = get("eth3d")
     assert code == 0
     assert "of them downloaded already" in out
-    assert [int(line.split()[-1]) for line in hub.asked if line.startswith("GET")] == [half]
+    assert hub.starts == [half]
     assert files_below(tmp_path / "data" / "eth3d") == PIPES
     assert not part.exists()
 
@@ -196,11 +141,13 @@ def test_what_a_killed_command_left_is_removed_and_a_part_of_another_version_is_
     left = tmp_path / "data" / ".eth3d.00000000.part" / "eth3d" / "pipes"
     left.mkdir(parents=True)
     (left / "combined_mesh.ply").write_bytes(b"half of")
-    (tmp_path / "data" / "eth3d.zip.0123456789ab.part").write_bytes(b"other")
+    other = tmp_path / "data" / "eth3d.zip.0123456789ab.incomplete"
+    other.write_bytes(b"other")
     assert get("eth3d")[0] == 0
     assert files_below(tmp_path / "data" / "eth3d") == PIPES
     assert not list((tmp_path / "data").glob(".*.part"))
-    assert [int(line.split()[-1]) for line in hub.asked if line.startswith("GET")] == [0]
+    assert hub.starts == [0]
+    assert not other.exists()
 
 
 @pytest.mark.parametrize(
@@ -309,7 +256,7 @@ def test_a_hostile_archive_writes_nothing(get, hub, monkeypatch, tmp_path, conte
     assert code == 1
     assert reason in said
     assert {f.name for f in tmp_path.rglob("*") if f.is_file() and ".cache" not in f.parts} <= {
-        "eth3d.zip", "eth3d.zip.sha256"
+        "eth3d.zip", "eth3d.zip.sha256", ".eth3d.zip.lock"
     }  # fmt: skip
 
 

@@ -7,70 +7,34 @@ import logging
 import os
 import re
 import shutil
+import subprocess
+import sys
 import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+import time
+from collections import namedtuple
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import huggingface_hub
 import pytest
 import torch
-from huggingface_hub import constants
+from huggingface_hub import constants, file_download
 from safetensors.torch import save
 
+from fake_hub import CLOSED, COMMIT, ENVIRONMENT, Hub, running, use_endpoint
 from freegeo.cli import models
 from freegeo.errors import UserError
 from freegeo.models import catalog, hub
 
-COMMIT = "0123456789" * 4
 CONTENT = save({"model.x": torch.arange(5000.0)})
-CLOSED = "http://127.0.0.1:9"
-ENVIRONMENT = (
-    *("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY", "HF_TOKEN", "SSL_CERT_FILE", "SSL_CERT_DIR"),
-    *("http_proxy", "https_proxy", "all_proxy", "no_proxy"),
-)
-
-
-class Hub:
-    """A model hub on this machine: what it sends, how it answers, and what it was asked for."""
-
-    def __init__(self):
-        self.content, self.status, self.tag, self.asked, self.is_hub = CONTENT, 200, None, [], True
-        ours = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def answer(self, *, with_content: bool) -> None:
-                ours.asked.append(f"{self.command} {self.path}")
-                self.send_response(ours.status)
-                if ours.is_hub:
-                    self.send_header("X-Repo-Commit", COMMIT)
-                    self.send_header("ETag", f'"{ours.tag or hashlib.sha256(ours.content).hexdigest()}"')
-                self.send_header("Content-Length", str(len(ours.content)))
-                self.end_headers()
-                if with_content:
-                    self.wfile.write(ours.content)
-
-            def do_HEAD(self):
-                self.answer(with_content=False)
-
-            def do_GET(self):
-                self.answer(with_content=True)
-
-            def log_message(self, *arguments):
-                pass
-
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self.server.server_port}"
+OTHER = save({"model.x": torch.arange(5000.0) + 1})
+Disk = namedtuple("Disk", ["total", "used", "free"])
 
 
 @pytest.fixture(scope="module")
 def running_hub():
-    hub = Hub()
-    thread = threading.Thread(target=hub.server.serve_forever, args=(0.01,))
-    thread.start()
-    yield hub
-    hub.server.shutdown()
-    thread.join()
-    hub.server.server_close()
+    with running(CONTENT) as hub:
+        yield hub
 
 
 @pytest.fixture(autouse=True)
@@ -88,16 +52,10 @@ def cache(monkeypatch, tmp_path) -> Path:
     huggingface_hub.close_session()
 
 
-def use_endpoint(monkeypatch, url: str) -> None:
-    monkeypatch.setattr(constants, "ENDPOINT", url)
-    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", url + "/{repo_id}/resolve/{revision}/{filename}")
-
-
 @pytest.fixture
 def online(monkeypatch, running_hub) -> Hub:
     """The hub in its usual state."""
-    running_hub.content, running_hub.status, running_hub.tag, running_hub.is_hub = CONTENT, 200, None, True
-    running_hub.asked.clear()
+    running_hub.reset(CONTENT)
     use_endpoint(monkeypatch, running_hub.url)
     return running_hub
 
@@ -121,7 +79,8 @@ def test_a_file_is_downloaded_once_and_then_needs_no_network(online, caplog):
     path = catalog.download("da3-base")
     assert path.read_bytes() == CONTENT
     asked = len(online.asked)
-    assert "GET /depth-anything/DA3-BASE/resolve/main/model.safetensors" in online.asked
+    assert online.asked[0] == "HEAD /depth-anything/DA3-BASE/resolve/main/model.safetensors"
+    assert f"GET /depth-anything/DA3-BASE/resolve/{COMMIT}/model.safetensors" in online.asked
     assert catalog.download("da3-base") == catalog.download("da3-base", check_hash=True) == path
     assert len(online.asked) == asked
     assert caplog.text == ""
@@ -200,9 +159,153 @@ def test_weights_that_do_not_load_name_the_repair(online):
         catalog.load_model("da3-base")
 
 
-# -- the right file: pinned, or the one of the first download
+# -- a download that was stopped
 
-OTHER = save({"model.x": torch.arange(5000.0) + 1})
+HALF = 10_000
+
+
+@pytest.fixture
+def broken_off(online, monkeypatch, cache) -> Path:
+    """The part that a download left which broke off in the middle; the hub is well again."""
+    monkeypatch.setattr(logging, "raiseExceptions", False)  # the client's logger writes to the stream of another test
+    monkeypatch.setattr(file_download.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(constants, "DOWNLOAD_CHUNK_SIZE", 1000)
+    online.breaks_off_at = HALF
+    reason()
+    (part,) = cache.rglob("*.incomplete")
+    assert part.read_bytes() == CONTENT[:HALF]
+    online.reset(CONTENT)
+    return part
+
+
+def layout(cache: Path) -> dict[str, str]:
+    """What the hub's cache holds: files with their sizes, links with their targets; without notes and locks."""
+    return {
+        path.relative_to(cache).as_posix(): str(path.readlink() if path.is_symlink() else path.stat().st_size)
+        for path in cache.rglob("*")
+        if (path.is_file() or path.is_symlink()) and path.suffix != ".sha256"
+    }
+
+
+@pytest.mark.parametrize("takes_ranges", [True, False])
+def test_a_download_that_broke_off_continues_where_it_was(online, broken_off, takes_ranges):
+    online.takes_ranges = takes_ranges
+    assert catalog.download("da3-base").read_bytes() == CONTENT
+    assert online.starts == [HALF]
+    assert not broken_off.exists()
+
+
+def test_the_cache_is_as_the_hub_library_leaves_it(online, broken_off, cache, tmp_path):
+    path = catalog.download("da3-base")
+    theirs = tmp_path / "theirs"
+    huggingface_hub.hf_hub_download("depth-anything/DA3-BASE", "model.safetensors", cache_dir=theirs)
+    assert layout(cache) == layout(theirs)
+    assert huggingface_hub.try_to_load_from_cache("depth-anything/DA3-BASE", "model.safetensors") == str(path)
+    online.starts.clear()
+    assert huggingface_hub.hf_hub_download("depth-anything/DA3-BASE", "model.safetensors") == str(path)
+    assert online.starts == []
+
+
+def test_a_part_of_another_version_is_removed_and_other_files_stay(online, broken_off):
+    online.content = OTHER
+    others = [broken_off.with_name(f"{name}.incomplete") for name in ("x.0123456789ab", digest(CONTENT))]
+    for other in others:
+        other.write_bytes(b"x")
+    assert catalog.download("da3-base").read_bytes() == OTHER
+    assert online.starts == [0]
+    assert not broken_off.exists()
+    assert all(other.exists() for other in others)
+
+
+@pytest.mark.parametrize(
+    ("part", "starts"),
+    [(b"x" * HALF, [HALF, 0]), (CONTENT[:-1] + b"x", [0]), (CONTENT + b"x", [0]), (CONTENT, []), (b"", [0])],
+)
+def test_a_part_is_used_as_far_as_it_is_right(online, broken_off, part, starts):
+    broken_off.write_bytes(part)
+    assert catalog.download("da3-base").read_bytes() == CONTENT
+    assert online.starts == starts
+
+
+def test_nothing_is_continued_that_could_not_be_compared_afterwards(online, cache):
+    online.tag = "some-tag"
+    part = hub.part_file(cache / "models--depth-anything--DA3-BASE" / "blobs", "model.safetensors", "some-tag")
+    part.parent.mkdir(parents=True)
+    part.write_bytes(b"x" * HALF)
+    assert catalog.download("da3-base").read_bytes() == CONTENT
+    assert online.starts == [0]
+
+
+def test_several_that_want_a_file_at_once_fetch_it_once(online, monkeypatch):
+    plain, all_want = hub.download_file, threading.Barrier(3, timeout=20)
+
+    def together(*arguments, **options):
+        all_want.wait()
+        return plain(*arguments, **options)
+
+    monkeypatch.setattr(hub, "download_file", together)
+    with ThreadPoolExecutor(3) as pool:
+        paths = set(pool.map(catalog.download, ["da3-base"] * 3))
+    assert [path.read_bytes() for path in paths] == [CONTENT]
+    assert online.starts == [0]
+
+
+def test_a_cache_without_links_gets_the_file_itself(online, monkeypatch, cache):
+    monkeypatch.setattr(constants, "HF_HUB_DISABLE_SYMLINKS", True)
+    for _ in range(2):
+        path = catalog.download("da3-base")
+        assert path.read_bytes() == CONTENT
+        assert not path.is_symlink()
+        assert files(cache) == ["model.safetensors"]
+        damaged(path, "truncated")
+    assert online.starts == [0, 0]
+
+
+def test_the_token_is_sent(online, monkeypatch):
+    monkeypatch.setenv("HF_TOKEN", "hf_secret")
+    catalog.download("da3-base")
+    assert online.tokens == ["Bearer hf_secret"]
+
+
+@pytest.mark.parametrize("tag", ["../../../outside", "a/b", ".."])
+def test_a_tag_that_is_no_file_name_writes_nothing(online, cache, tag):
+    online.tag = tag
+    assert "does not answer as a model hub does" in reason()
+    assert files(cache.parent) == []
+
+
+@pytest.mark.slow
+def test_a_command_that_was_killed_continues_with_one_request(tmp_path):
+    content = save({"model.x": torch.arange(6_500_000.0)})  # parts are written by 10 MiB
+    environment = {name: value for name, value in os.environ.items() if name not in ENVIRONMENT}
+    command = [sys.executable, "-m", "freegeo.cli.app", "models", "download", "da3-base"]
+    with running(content) as hub:
+        environment |= {"HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path)}
+        hub.breaks_off_at = len(content) - 1000
+        hub.may_hang_up.clear()
+        killed = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        assert hub.has_broken_off.wait(60)
+        (part,) = tmp_path.rglob("*.incomplete")
+        wait_until(lambda: part.stat().st_size == 20 << 20)
+        killed.kill()
+        killed.wait()
+        hub.may_hang_up.set()
+        hub.reset(content)
+        again = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        assert hub.starts == [20 << 20]
+        path = Path(again.stdout.strip().splitlines()[-1])
+        assert path.read_bytes() == content
+        assert not part.exists()
+
+
+def wait_until(holds) -> None:
+    end = time.monotonic() + 30
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+# -- the right file: pinned, or the one of the first download
 
 
 def digest(content: bytes) -> str:
@@ -281,6 +384,17 @@ def test_the_file_of_the_first_download_counts_from_then_on(online, cache, tag, 
     assert all(f"/resolve/{COMMIT}/" in line for line in online.asked)
     shutil.rmtree(folder)
     assert catalog.download("da3-base").read_bytes() == OTHER
+
+
+def test_a_file_that_the_hub_library_shares_between_repositories_is_known_by_its_own_hash(online, cache):
+    path = Path(huggingface_hub.hf_hub_download("depth-anything/DA3-BASE", "model.safetensors"))
+    blob, shared = path.resolve(), cache / "blobs" / "ab" / ("ab" * 32)
+    shared.parent.mkdir(parents=True)
+    blob.rename(shared)
+    blob.symlink_to(os.path.relpath(shared, blob.parent))
+    online.asked.clear()
+    assert catalog.download("da3-base") == path
+    assert online.asked == []
 
 
 def test_a_file_that_changed_since_it_was_checked_is_read_again(online, tmp_path):
@@ -411,12 +525,22 @@ def test_a_page_that_is_no_hub(online):
     assert "does not answer as a model hub does. Check HF_ENDPOINT and the proxy" in reason()
 
 
-def test_a_full_disk_is_named(online, monkeypatch, cache):
-    def full(*arguments, **options):
+def test_a_disk_that_is_too_small_is_named_before_the_download(online, monkeypatch, cache):
+    monkeypatch.setattr(hub.shutil, "disk_usage", lambda folder: Disk(len(CONTENT), 0, len(CONTENT) - 1))
+    assert f"the disk of {cache} has too little room. Make room, or set HF_HOME to another disk" in reason()
+    assert online.starts == []
+
+
+def test_what_was_there_when_the_disk_became_full_is_kept(online, monkeypatch, cache):
+    def full(url, file, **options):
+        file.write(CONTENT[:5000])
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(huggingface_hub, "hf_hub_download", full)
-    assert f"the disk of {cache} is full. Make room, or set HF_HOME to another disk" in reason()
+    with monkeypatch.context() as patch:
+        patch.setattr(file_download, "http_get", full)
+        assert f"the disk of {cache} has too little room. Make room, or set HF_HOME to another disk" in reason()
+    assert catalog.download("da3-base").read_bytes() == CONTENT
+    assert online.starts == [5000]
 
 
 def test_a_cache_that_cannot_be_written_to(online, monkeypatch):

@@ -3,7 +3,7 @@
 ```
 DATA/<name>.zip            the archive
 DATA/<name>.zip.sha256     what it was when it was compared
-DATA/<name>.zip.<hash>.part   what is there of it after a download that was stopped; the next one continues
+DATA/<name>.zip.<hash>.incomplete   what is there of it after a download that was stopped; the next one continues
 DATA/<name>/               its content, which appears as a whole
 ```
 """
@@ -11,7 +11,6 @@ DATA/<name>/               its content, which appears as a whole
 from __future__ import annotations
 
 import errno
-import hashlib
 import logging
 import shutil
 import stat
@@ -27,7 +26,18 @@ from freegeo.data.datasets.base import Archive
 from freegeo.data.datasets.registry import get_dataset
 from freegeo.errors import DamagedError, FreeGeoError, UserError
 from freegeo.files import inside, scratch_folder
-from freegeo.models.hub import HubFile, digest_of, endpoint, is_verified, noted_digest, published, sha256_of, why
+from freegeo.models.hub import (
+    HubFile,
+    digest_of,
+    download_file,
+    endpoint,
+    is_verified,
+    note_digest,
+    noted_digest,
+    part_file,
+    published,
+    why,
+)
 
 if TYPE_CHECKING:
     from huggingface_hub import HfFileMetadata
@@ -107,11 +117,10 @@ def offer(data: Path, name: str) -> Offer:
             f"{endpoint()} has another {path.name} than the one that was downloaded first (SHA-256 {announced} instead "
             f"of {noted}); it was not downloaded. If you trust the new one, remove {path}.sha256 and run again."
         )
-    version = hashlib.sha256((found.etag or "").encode()).hexdigest()[:12]
-    part = path.with_name(f"{path.name}.{version}.part")
+    part, digest = part_file(data, path.name, found.etag), noted or announced
     return Offer(
         name=name, archive=dataset.archive, path=path, state="missing", size=found.size or 0,
-        kept=part.stat().st_size if part.is_file() else 0, digest=noted or announced, part=part,
+        kept=part.stat().st_size if digest and part.is_file() else 0, digest=digest, part=part,
         url=_address(path, found.commit_hash),
     )  # fmt: skip
 
@@ -135,23 +144,28 @@ def fetch(one: Offer) -> Path:
         FreeGeoError: the archive is damaged, or not the right one.
     """
     path = one.path
-    if one.part is not None:
-        try:
-            _continue(one, one.part)
-        # The client raises errors of several libraries; none of them is ours.
-        except Exception as error:
-            logger.debug("download of %s failed: %r", path.name, error)
-            raise _failed(error, path) from None
-    if is_verified(path, one.digest, check_hash=True):
-        return path
-    if one.part is not None:
-        found = sha256_of(path)
-        path.unlink()
+    if one.part is None:
+        if is_verified(path, one.digest, check_hash=True):
+            return path
         raise FreeGeoError(
-            f"{path.name}: what was downloaded is not what {endpoint()} announced (SHA-256 {found} instead of "
-            f"{one.digest or 'a zip file'}), and was removed. Run again, perhaps on another network."
+            f"{path}: damaged, or not the right archive. Remove it and run again; it is then downloaded."
         )
-    raise FreeGeoError(f"{path}: damaged, or not the right archive. Remove it and run again; it is then downloaded.")
+    try:
+        found = download_file(
+            one.url, path, part=one.part, size=one.size or None, digest=one.digest,
+            lock=path.with_name(f".{path.name}.lock"),
+        )  # fmt: skip
+    # The client raises errors of several libraries; none of them is ours.
+    except Exception as error:
+        logger.debug("download of %s failed: %r", path.name, error)
+        raise _failed(error, path) from None
+    if found == (one.digest or found) and note_digest(path, found):
+        return path
+    path.unlink(missing_ok=True)
+    raise FreeGeoError(
+        f"{path.name}: what was downloaded is not what {endpoint()} announced (SHA-256 {found} instead of "
+        f"{one.digest or 'a zip file'}), and was removed. Run again, perhaps on another network."
+    )
 
 
 def unpack(one: Offer, data: Path, on_bytes: Callable[[int, int], None] = lambda done, total: None) -> Path:
@@ -246,20 +260,6 @@ def _members(archive: zipfile.ZipFile, one: Offer, folder: Path) -> list[zipfile
 
 def _refused(one: Offer, reason: str) -> FreeGeoError:
     return FreeGeoError(f"{one.path}: was not unpacked, because {reason}. Remove it; it is not the published archive.")
-
-
-def _continue(one: Offer, part: Path) -> None:
-    """Append what is missing of an archive; the hub library's own function for whole files begins anew each time."""
-    from huggingface_hub.file_download import http_get
-    from huggingface_hub.utils import build_hf_headers
-
-    part.parent.mkdir(parents=True, exist_ok=True)
-    with part.open("ab") as file:
-        http_get(
-            one.url, file, resume_size=file.tell(), headers=build_hf_headers(), expected_size=one.size,
-            displayed_filename=one.path.name,
-        )  # fmt: skip
-    part.replace(one.path)
 
 
 def _announced(path: Path) -> HfFileMetadata:

@@ -123,7 +123,9 @@ def weights_file(name: str, checkpoint: str | Path | None = None) -> Path:
 
 
 def download(name: str, *, check_hash: bool = False) -> Path:
-    """Fetch a model's checkpoint from the hub (resumable) and return its path; a damaged one is fetched again.
+    """Fetch a model's checkpoint from the hub and return its path; a damaged one is fetched again.
+
+    A download that was stopped continues where it was.
 
     `check_hash` reads the whole of a file that is there already; without it, its length is checked.
     """

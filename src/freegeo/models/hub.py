@@ -1,4 +1,8 @@
-"""Files of the model hub: kept in its cache, checked before they are used, and a reason when one cannot be fetched."""
+"""Files of the model hub: kept in its cache, checked before they are used, and a reason when one cannot be fetched.
+
+`huggingface_hub` looks after the cache, the log-in, proxies and the network; its own download of a file begins anew
+after each stop, so the content is fetched by `download_file`, into the place where the cache expects it.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ import hashlib
 import logging
 import os
 import re
+import shutil
 import ssl
 import zipfile
 from dataclasses import dataclass
@@ -26,6 +31,7 @@ REACHABLE_WITHIN_S = 5.0
 _PROXIES = ("HTTPS_PROXY", "HTTP_PROXY", "ALL_PROXY")
 _PASSWORD = re.compile(r"(^|//)[^/]*@")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
+_FILE_NAME = re.compile(r"\w[\w.+=-]*")
 _INSTEAD = f"pass --checkpoint FILE, or use the embedded model: --model {EMBEDDED_MODEL}."
 
 
@@ -56,7 +62,7 @@ def fetch(item: ModelEntry, *, check_hash: bool = False) -> Path:
     import huggingface_hub
 
     assert item.hub_id is not None
-    kept = _kept(item)
+    kept, path, digest = _kept(item), None, None
     revision, expected = item.revision, item.sha256
     if first := kept or _gone(item):
         # What was downloaded first counts, not what the hub calls its newest today.
@@ -66,17 +72,23 @@ def fetch(item: ModelEntry, *, check_hash: bool = False) -> Path:
             return kept
         logger.info("%s: truncated or damaged; it is downloaded again.", kept)
     try:
-        url = huggingface_hub.hf_hub_url(item.hub_id, item.hub_file, revision=revision)
-        announced = digest_of(published(url).etag)
-        if expected is not None and announced not in (None, expected):
-            raise _another_file(item, announced, expected)
-        if kept is not None and not kept.is_symlink():
-            kept.unlink()  # a cache without links would keep it in the place of the new file
-        path = Path(
-            huggingface_hub.hf_hub_download(
-                item.hub_id, item.hub_file, revision=revision, force_download=kept is not None
-            )
-        )
+        announced = published(huggingface_hub.hf_hub_url(item.hub_id, item.hub_file, revision=revision))
+        digest = digest_of(announced.etag)
+        if expected is not None and digest not in (None, expected):
+            raise _another_file(item, digest, expected)
+        place = _place(item, announced)
+        found = download_file(
+            huggingface_hub.hf_hub_url(item.hub_id, item.hub_file, revision=announced.commit_hash), place,
+            part=part_file(_folder(item) / "blobs", Path(item.hub_file).name, announced.etag), size=announced.size,
+            digest=expected or digest, lock=_lock(item, announced),
+        )  # fmt: skip
+        if found == (expected or digest or found):
+            if kept is not None and kept.resolve() != place.resolve():
+                kept.unlink()  # it would keep the place of the new file
+            # The content is there, so this only adds what the cache notes of a file: its revision, and a link.
+            path = Path(huggingface_hub.hf_hub_download(item.hub_id, item.hub_file, revision=revision))
+            if not path.samefile(place):
+                raise RuntimeError("another version was published meanwhile")
     except UserError:
         raise
     # The client raises errors of several libraries, by its version and the proxy; none of them is ours.
@@ -89,17 +101,93 @@ def fetch(item: ModelEntry, *, check_hash: bool = False) -> Path:
             f"the checkpoint of {item.name} ({item.hub_id}, {size}) {missing} and could not be downloaded: {reason}. "
             f"{remedy} and run `freegeo models download {item.name}`, {_INSTEAD}"
         ) from None
-    if is_verified(path, expected or announced, check_hash=True):
-        return path
-    found = sha256_of(path)
-    path.resolve().unlink()
-    path.unlink(missing_ok=True)
-    if announced is None and expected is not None:
+    if path is not None:
+        if note_digest(path, found):
+            return path
+        path.resolve().unlink()
+        path.unlink(missing_ok=True)
+    elif digest is None and expected is not None:
         raise _another_file(item, found, expected)
     raise UserError(
-        f"{path}: the download differs from what {endpoint()} announced; something on the way damages it. Run "
+        f"{item.hub_file} of {item.name}: the download differs from what {endpoint()} announced; something on the way "
+        "damages it, and it was not kept. Run "
         f"`freegeo models download {item.name}` on another network, {_INSTEAD}"
     )
+
+
+def download_file(url: str, target: Path, *, part: Path, size: int | None, digest: str | None, lock: Path) -> str:
+    """Fetch a file of the hub, or what is missing of it, compare it, and put it in its place; returns its SHA-256.
+
+    What a stop left in `part` is continued. Only with `size` and `digest`, though: without them nothing tells that the
+    whole is right, and it begins anew. A continued file with another SHA-256 is fetched once more from its beginning.
+    When several processes want the file, one fetches it, and the others wait for it.
+
+    Args:
+        url: address at the hub, of one commit.
+        target: where the file appears if it has the SHA-256 `digest`, or any where that is None. Otherwise nothing
+            changes there, and the part is removed.
+        part: by `part_file`. The parts of other versions beside it are removed.
+        size: bytes that the hub announced.
+        digest: SHA-256 that the file must have.
+        lock: file that is locked meanwhile, and stays.
+
+    Raises:
+        Exception: whatever the client of the hub raises; the part stays. OSError when the disk is too small.
+    """
+    from huggingface_hub.utils import WeakFileLock
+
+    for folder in (lock.parent, part.parent, target.parent):
+        folder.mkdir(parents=True, exist_ok=True)
+    with WeakFileLock(lock):
+        if target.is_file() and target.stat().st_size == size:
+            found = sha256_of(target)
+            if found == (digest or found):
+                return found  # another process fetched it meanwhile
+        _remove_useless(part, size if digest else None)
+        is_continued = part.exists()
+        found = _complete(url, part, size)
+        if is_continued and found != digest:
+            part.unlink()
+            found = _complete(url, part, size)
+        if found == (digest or found):
+            part.replace(target)
+        else:
+            part.unlink()
+        return found
+
+
+def part_file(folder: Path, name: str, etag: str | None) -> Path:
+    """Return where a version of a file of the hub grows while it is downloaded."""
+    # The end of the name is the one of the hub's cache, whose tools find and remove such files.
+    return folder / f"{name}.{hashlib.sha256((etag or '').encode()).hexdigest()[:12]}.incomplete"
+
+
+def _remove_useless(part: Path, size: int | None) -> None:
+    """Remove a part that cannot become a file of `size` bytes that is known, and those of other versions."""
+    if part.exists() and (size is None or part.stat().st_size > size):
+        part.unlink()
+    name = part.name.rsplit(".", 2)[0]
+    other = re.compile(re.escape(name) + r"\.[0-9a-f]{12}\.incomplete")
+    for path in part.parent.iterdir():
+        if path != part and other.fullmatch(path.name):
+            path.unlink()
+
+
+def _complete(url: str, part: Path, size: int | None) -> str:
+    """Append what is missing of a file, and return the SHA-256 of the whole."""
+    from huggingface_hub.file_download import http_get
+    from huggingface_hub.utils import build_hf_headers
+
+    with part.open("ab") as file:
+        there = file.tell()
+        if size is not None and size - there > shutil.disk_usage(part.parent).free:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(part))
+        http_get(
+            # A range of a compressed answer would not be one of the file.
+            url, file, resume_size=there, headers={**build_hf_headers(), "Accept-Encoding": "identity"},
+            expected_size=size, displayed_filename=part.name.rsplit(".", 2)[0],
+        )  # fmt: skip
+    return sha256_of(part)
 
 
 def local_file(item: ModelEntry) -> tuple[str, str] | None:
@@ -138,11 +226,19 @@ def is_verified(path: Path, expected: str | None, *, check_hash: bool) -> bool:
     if fresh and not check_hash and noted_digest(path) == (expected or noted_digest(path)):
         return _has_its_length(path)
     if _has_its_length(path) and (digest := sha256_of(path)) == (expected or digest):
-        _write_note(note, digest, path)
+        _write_note(path, digest)
         return True
     if note.is_file():
         os.utime(note, (0, 0))  # it still says what the file should be, and never again that this file was compared
     return False
+
+
+def note_digest(path: Path, digest: str) -> bool:
+    """Note the SHA-256 of a file that was just compared; False, and no note, if the file is shorter than it says."""
+    if not _has_its_length(path):
+        return False
+    _write_note(path, digest)
+    return True
 
 
 def sha256_of(path: Path) -> str:
@@ -187,6 +283,25 @@ def _folder(item: ModelEntry) -> Path:
     return Path(cache_folder(), f"models--{(item.hub_id or '').replace('/', '--')}")
 
 
+def _place(item: ModelEntry, announced: HfFileMetadata) -> Path:
+    """Return where the cache keeps the content of a file: by its entity tag, or without links at its own name."""
+    from huggingface_hub import constants, errors
+    from huggingface_hub.file_download import are_symlinks_supported
+
+    etag, commit = announced.etag or "", announced.commit_hash or ""
+    if not (_FILE_NAME.fullmatch(etag) and _FILE_NAME.fullmatch(commit)):
+        raise errors.FileMetadataError(f"no commit, or no entity tag: {commit!r}, {etag!r}")
+    if are_symlinks_supported(constants.HF_HUB_CACHE):
+        return _folder(item) / "blobs" / etag
+    return _folder(item) / "snapshots" / commit / item.hub_file
+
+
+def _lock(item: ModelEntry, announced: HfFileMetadata) -> Path:
+    """Return the lock that `huggingface_hub` itself takes while it downloads that file."""
+    folder = _folder(item)
+    return folder.parent / ".locks" / folder.name / f"{announced.etag}.lock"
+
+
 def _revision(kept: Path, item: ModelEntry) -> str:
     """Return the commit of a file in the cache: the name of the folder that holds the repository's files."""
     return kept.parents[len(Path(item.hub_file).parts) - 1].name
@@ -194,7 +309,8 @@ def _revision(kept: Path, item: ModelEntry) -> str:
 
 def _known_digest(kept: Path) -> str | None:
     """Return the SHA-256 that a file of the cache had when it was downloaded, by the note or the cache's own name."""
-    return noted_digest(kept) or digest_of(kept.resolve().name)
+    # Not the end of the chain of links: where repositories share files, that is named by another hash.
+    return noted_digest(kept) or (digest_of(kept.readlink().name) if kept.is_symlink() else None)
 
 
 def _note(path: Path) -> Path:
@@ -210,8 +326,9 @@ def noted_digest(path: Path) -> str | None:
         return None
 
 
-def _write_note(note: Path, digest: str, path: Path) -> None:
+def _write_note(path: Path, digest: str) -> None:
     """Write the note whole; a cache that cannot be written to goes without, and its file is read at each use."""
+    note = _note(path)
     part = note.with_name(f"{note.name}.{os.getpid()}")
     try:
         part.write_text(f"{digest}  {path.name}\n", "utf-8")
@@ -281,7 +398,7 @@ def why(error: BaseException, item: HubFile) -> tuple[str, str]:
     if proxies and (isinstance(error, ValueError) or type(error).__name__ == "InvalidURL"):
         return f"the proxy in {proxies} cannot be used ({text})", "Write it as http://HOST:PORT"
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f"the disk of {item.folder} is full", f"Make room, or {item.elsewhere} another disk,"
+        return f"the disk of {item.folder} has too little room", f"Make room, or {item.elsewhere} another disk,"
     if isinstance(error, PermissionError):
         place = error.filename or item.folder
         return f"{place} cannot be written to", f"{item.elsewhere[0].upper()}{item.elsewhere[1:]} a folder that can be"
