@@ -179,7 +179,7 @@ def broken_off(online, monkeypatch, cache) -> Path:
 
 
 def layout(cache: Path) -> dict[str, str]:
-    """What the hub's cache holds: files with their sizes, links with their targets; without notes and locks."""
+    """What the hub's cache holds: files with their sizes, links with their targets, locks; without notes."""
     return {
         path.relative_to(cache).as_posix(): str(path.readlink() if path.is_symlink() else path.stat().st_size)
         for path in cache.rglob("*")
@@ -267,7 +267,7 @@ def test_the_token_is_sent(online, monkeypatch):
     assert online.tokens == ["Bearer hf_secret"]
 
 
-@pytest.mark.parametrize("tag", ["../../../outside", "a/b", ".."])
+@pytest.mark.parametrize("tag", ["../../../outside", ".."])
 def test_a_tag_that_is_no_file_name_writes_nothing(online, cache, tag):
     online.tag = tag
     assert "does not answer as a model hub does" in reason()

@@ -13,6 +13,7 @@ import os
 import re
 import shutil
 import ssl
+import threading
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,8 @@ _PROXIES = ("HTTPS_PROXY", "HTTP_PROXY", "ALL_PROXY")
 _PASSWORD = re.compile(r"(^|//)[^/]*@")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _FILE_NAME = re.compile(r"\w[\w.+=-]*")
+_quiet = threading.Lock()
+"""Held while the hub library's logger is silent, so that no thread takes that for its usual level."""
 _INSTEAD = f"pass --checkpoint FILE, or use the embedded model: --model {EMBEDDED_MODEL}."
 
 
@@ -357,12 +360,13 @@ def published(url: str) -> HfFileMetadata:
     import huggingface_hub
 
     hub_logger = logging.getLogger("huggingface_hub")
-    level = hub_logger.level
-    hub_logger.setLevel(logging.CRITICAL)
-    try:
-        return huggingface_hub.get_hf_file_metadata(url, timeout=REACHABLE_WITHIN_S)
-    finally:
-        hub_logger.setLevel(level)
+    with _quiet:
+        level = hub_logger.level
+        hub_logger.setLevel(logging.CRITICAL)
+        try:
+            return huggingface_hub.get_hf_file_metadata(url, timeout=REACHABLE_WITHIN_S)
+        finally:
+            hub_logger.setLevel(level)
 
 
 def _described(item: ModelEntry) -> HubFile:
