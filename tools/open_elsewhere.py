@@ -1,9 +1,12 @@
-"""Writes the sample export that the pictures docs/figures/open-*.png show: a generated room, with exact depth and cameras.
+"""Writes the sample export that the pictures docs/figures/open-*.png show: a generated room, exact depth and cameras.
 
-`python tools/open_elsewhere.py FOLDER` needs the extra `colmap` and takes a minute; the same folder comes out each time.
-It holds what `freegeo export` writes of ten photos of 1008 x 756 pixels and maps of 504 x 378. The world is that of the
-first camera, as a model predicts it, so that nothing is upright by itself. The pictures show these files in the programs
-of docs/formats.md, opened as described there, in windows of a virtual screen (Xvfb) with software rendering.
+`python tools/open_elsewhere.py FOLDER` needs the extra `colmap` and takes a minute; the files are the same each time.
+They are what `freegeo export` writes of ten photos of 1008 x 756 pixels and maps of 504 x 378. The world is that of the
+first camera, as a model predicts it, so nothing is upright by itself.
+
+The pictures are windows on a virtual screen (Xvfb, 1280 x 900 pixels, `LIBGL_ALWAYS_SOFTWARE=1`) after the steps of
+docs/formats.md, "Open the files in other programs". They were taken with `import -window root` of ImageMagick, cropped,
+and reduced to 220 colours. In Blender, a script did the steps, and chose the view.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from freegeo.export.reconstruction import Reconstruction, Scale
 
 DOMAIN, ROOM, VIEWS = "tex", 2, 10
 MAP_HW, PHOTO_SCALE = (378, 504), 2
-FORMATS = ("npz", "ply", "glb", "mesh", "colmap", "nerfstudio", "depth", "video")
+FORMATS = ("ply", "glb", "mesh", "colmap", "video")
 
 
 def sample() -> tuple[Reconstruction, list[MemoryPhoto]]:
