@@ -24,6 +24,8 @@ from freegeo.geometry.rotation import closest_rotation  # noqa: E402
 from freegeo.geometry.se3 import from_Rt  # noqa: E402
 from freegeo.models.catalog import build_empty  # noqa: E402
 from freegeo.models.images import read_some  # noqa: E402
+from freegeo.models.pi3_priors import given_of, pose_tables, turn  # noqa: E402
+from freegeo.models.precision import Compute  # noqa: E402
 from freegeo.types import Priors, ViewTokens  # noqa: E402
 from parity_pi3 import cases  # noqa: E402
 from parity_vggt_functions import synthetic  # noqa: E402
@@ -231,6 +233,40 @@ def test_any_part_may_be_known(pi3x, cameras):
     assert relative_error(again, found["poses of some"]) <= 1e-6
     one = Priors(T_cam_world=T, has_pose=torch.tensor([True, False, False, False]))
     assert torch.equal(last_level(pi3x, tokens, one), nothing)
+
+
+@torch.no_grad()
+def test_known_poses_are_prepared_in_float32_under_autocast(cameras):
+    T, _ = cameras
+    x = torch.randn(2, VIEWS * 16, 16, generator=torch.Generator().manual_seed(10))
+
+    def turned() -> list[torch.Tensor]:
+        given = given_of(Priors(T_cam_world=T), (32, 32), T.device)
+        tables = pose_tables(given.T_cam_world[0], (4, 4), 16)
+        return [given.T_cam_world, *(turn(x, tables, what) for what in ("query", "value", "output"))]
+
+    exact = turned()
+    with Compute(precision="bf16").autocast():
+        for found, expected in zip(turned(), exact, strict=True):
+            assert torch.equal(found, expected)
+
+
+@torch.no_grad()
+def test_what_losses_compare_is_read_in_float32_under_autocast(model):
+    with Compute(precision="bf16").autocast():
+        tokens = model.embed(noise(2)[None])
+        levels = model.aggregate(tokens, layers=[model.config.last_pair, model.config.readout]).levels
+    readout = levels[model.config.readout][0]
+    assert torch.equal(readout, model.point_decoder.first_norm(levels[model.config.last_pair][0]))
+
+
+def test_what_stands_for_unknown_intrinsics_has_no_part(pi3x, cameras):
+    _, K = cameras
+    tokens, some = pi3x.embed(noise(VIEWS)[None]), torch.tensor([True, False, True, False])
+    told = last_level(pi3x, tokens, Priors(K=K, has_K=some))
+    other = K.clone()
+    other[:, ~some] = torch.nan
+    assert torch.equal(last_level(pi3x, tokens, Priors(K=other, has_K=some)), told)
 
 
 @pytest.mark.parametrize("near", [0.0, 1e-6, 1e-2])

@@ -56,7 +56,7 @@ class HeadDecoder(nn.Module):
         return self.linear_out(x)
 
     def first_norm(self, tokens: Tensor) -> Tensor:
-        """Return what the first block's attention reads of features (..., C), in float32."""
+        """Return what the first block's attention reads of features (..., C)."""
         first = self.blocks[0]
         assert isinstance(first, Block)
         return first.norm1(self.projects(tokens))
@@ -236,7 +236,8 @@ class Pi3(ReconstructionModel):
                 both = torch.cat([within_BSND, x_BSND], dim=-1)
                 levels[pair] = (both[:, :, special:], both[:, :, :special])
         if self.config.readout in wanted:
-            readout = self.point_decoder.first_norm(levels[last][0])
+            with torch.autocast(patches_BSPD.device.type, enabled=False):
+                readout = self.point_decoder.first_norm(levels[last][0])
             # Registers have no part in it, since none of them is a camera token.
             levels[self.config.readout] = (readout, readout[:, :, :0])
         return {level: value for level, value in levels.items() if level in wanted}

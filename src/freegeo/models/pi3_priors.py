@@ -29,9 +29,9 @@ class Given:
     posed: tuple[list[int], ...] = ()
     """Views of each scene whose pose is used."""
     rays: tuple[Tensor, Tensor] | None = None
-    """The slopes x/z and y/z of every pixel's ray (B, S, 2, H, W), and 1 for views where they are known (B, S)."""
+    """The slopes x/z and y/z of every pixel's ray (B, S, 2, H, W), and views where they are known (B, S)."""
     depth: tuple[Tensor, Tensor] | None = None
-    """Depth over the scene's mean depth, and 1 where it is known (B, S, 2, H, W); 1 for views with depth (B, S)."""
+    """Depth over the scene's mean depth, and 1 where it is known (B, S, 2, H, W); views with depth (B, S)."""
 
 
 def given_of(priors: Priors, image_hw: tuple[int, int], device: torch.device) -> Given:
@@ -110,20 +110,20 @@ def prepare(
         used = has_pose & (has_pose.sum(1, keepdim=True) > 1)
         posed = tuple(views.nonzero()[:, 0].tolist() for views in used)
         if any(posed):
-            T_cam_world = inverse(_normalised(T_world_cam, unit, has_depth, counted)).to(device)
+            T_cam_world = inverse(_normalised(T_world_cam, unit, has_depth, counted)).float().to(device)
     return Given(
         T_cam_world=T_cam_world,
         posed=posed,
-        rays=None if rays is None or not has_rays.any() else (rays.to(device), has_rays.float().to(device)),
-        depth=None if depth_z is None or not has_depth.any() else (depth_z.to(device), has_depth.float().to(device)),
+        rays=None if rays is None or not has_rays.any() else (rays.to(device), has_rays.to(device)),
+        depth=None if depth_z is None or not has_depth.any() else (depth_z.to(device), has_depth.to(device)),
     )
 
 
 def _normalised(T_world_cam: Tensor, unit_B: Tensor, has_depth: Tensor, counted: Tensor) -> Tensor:
-    """Return poses in the first view's frame, float32; depth gives their unit, and where there is none, they do."""
-    T = (inverse(T_world_cam[:, :1].double()) @ T_world_cam.double()).float()
+    """Return poses in the first view's frame, float64; depth gives their unit, and where there is none, they do."""
+    T = inverse(T_world_cam[:, :1].double()) @ T_world_cam.double()
     t = T[..., :3, 3] / unit_B[:, None, None]
-    distance, others = t.norm(dim=-1), counted[:, 1:].float()
+    distance, others = t.norm(dim=-1), counted[:, 1:].double()
     mean = (distance[:, 1:] * others).sum(1) / others.sum(1).clamp(min=1)
     rescaled = ~has_depth.any(1) & (distance.amax(1) >= STATIC)
     t = torch.where(rescaled[:, None, None], t / (mean + SMALL)[:, None, None], t)
@@ -144,7 +144,10 @@ class PoseTables:
 
 
 def pose_tables(T_cam_world_S44: Tensor, grid_hw: tuple[int, int], head_dim: int) -> PoseTables:
-    """Build the tables of the posed views of a scene; ValueError for a head width that 8 does not divide."""
+    """Build the tables of the posed views of a scene, in float32 under autocast too.
+
+    ValueError for a head width that 8 does not divide.
+    """
     if head_dim % 8:
         raise ValueError(f"poses turn heads of a width divisible by 8, got {head_dim}")
     device, count = T_cam_world_S44.device, head_dim // 8
@@ -153,16 +156,21 @@ def pose_tables(T_cam_world_S44: Tensor, grid_hw: tuple[int, int], head_dim: int
     (column, row) = (
         (angle.cos(), angle.sin()) for angle in (n.flatten()[:, None] * frequencies for n in (columns, rows))
     )
-    return PoseTables(T_cam_world_S44, inverse(T_cam_world_S44), column, row)
+    with torch.autocast(device.type, enabled=False):
+        return PoseTables(T_cam_world_S44, inverse(T_cam_world_S44), column, row)
 
 
 def turn(x_HLd: Tensor, tables: PoseTables, what: Literal["query", "value", "output"]) -> Tensor:
-    """Turn queries, keys and values ("value" for both), or what attention returns; heads, tokens of all views, d."""
+    """Turn queries, keys and values ("value" for both), or what attention returns; heads, tokens of all views, d.
+
+    In float32 under autocast too.
+    """
     views, patches = len(tables.T_S44), len(tables.row_Pf[0])
     x = x_HLd.float().unflatten(1, (views, patches))
     half, quarter = x.shape[-1] // 2, x.shape[-1] // 4
     matrix = {"query": tables.T_S44.mT, "value": tables.T_inverse_S44, "output": tables.T_S44}[what]
-    by_pose = torch.einsum("sij,hspkj->hspki", matrix, x[..., :half].unflatten(-1, (-1, 4))).flatten(-2)
+    with torch.autocast(x.device.type, enabled=False):
+        by_pose = torch.einsum("sij,hspkj->hspki", matrix, x[..., :half].unflatten(-1, (-1, 4))).flatten(-2)
     back = what == "output"
     by_column = _rotated(x[..., half : half + quarter], tables.column_Pf, back=back)
     by_row = _rotated(x[..., half + quarter :], tables.row_Pf, back=back)

@@ -215,11 +215,12 @@ class Pi3X(Pi3):
         patches, grid_hw = tokens.tokens, tokens.grid_hw
         if given.rays is not None:
             rays, has_rays = given.rays
-            patches = patches + self.ray_embed(rays.flatten(0, 1)).view_as(patches) * has_rays[..., None, None]
+            found = self.ray_embed(rays.flatten(0, 1)).view_as(patches)
+            patches = patches + torch.where(has_rays[..., None, None], found, 0)
         if given.depth is not None:
             depth, has_depth = given.depth
             found = self.depth_encoder(depth.flatten(0, 1), grid_hw).view_as(patches) + self.depth_emb
-            patches = patches + found * has_depth[..., None, None]
+            patches = patches + torch.where(has_depth[..., None, None], found, 0)
         return self._levels(patches, grid_hw, wanted, lambda pair, x: self._with_poses(pair, x, given, grid_hw))
 
     def _with_poses(self, pair: int, x_BSND: Tensor, given: Given, grid_hw: tuple[int, int]) -> Tensor:
