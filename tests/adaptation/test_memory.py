@@ -21,7 +21,7 @@ from freegeo.models.catalog import build_empty
 from freegeo.models.da3 import DA3
 from freegeo.models.da3_config import DA3Config
 from freegeo.models.precision import Compute
-from tiny_models import DEFAULTS, randomise, tiny_da3, tiny_mapanything, tiny_vggt
+from tiny_models import DEFAULTS, randomise, tiny_da3, tiny_mapanything, tiny_pi3, tiny_pi3x, tiny_vggt
 
 CPU, CUDA, MPS = Compute(), torch.device("cuda"), torch.device("mps")
 GB = 1_000_000_000
@@ -246,7 +246,7 @@ def test_reconstruction_says_how_many_views_fit():
         plan_reconstruction(model, 4, (504, 378), compute=compute, budget=2 * GB)
 
 
-@pytest.mark.parametrize("build", [tiny_da3, tiny_vggt, tiny_mapanything])
+@pytest.mark.parametrize("build", [tiny_da3, tiny_vggt, tiny_pi3x, tiny_mapanything])
 def test_an_adapter_that_is_on_does_not_change_a_model_s_shape(build):
     model = build()
     before = shape_of(model)
@@ -294,7 +294,7 @@ def test_reconstruction_s_peak_agrees_with_what_a_gpu_measured(name, views):
     assert sum(size for _, size in parts) / GB == pytest.approx(RECONSTRUCTION_GB[name, views], rel=0.15)
 
 
-@pytest.mark.parametrize("build", [tiny_da3, tiny_vggt])
+@pytest.mark.parametrize("build", [tiny_da3, tiny_vggt, tiny_pi3, tiny_pi3x, tiny_mapanything])
 @pytest.mark.parametrize("views", [4, 24])
 def test_reconstruction_s_peak_covers_the_tensors_alive(build, views):
     model = build()

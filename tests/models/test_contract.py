@@ -14,10 +14,13 @@ sys.path.append(str(TESTS))  # the parity modules are shared with the full parit
 
 import parity_da3  # noqa: E402
 import parity_mapanything  # noqa: E402
+import parity_pi3  # noqa: E402
 import parity_vggt  # noqa: E402
 from fixture_tools import relative_error  # noqa: E402
 from freegeo.errors import UserError  # noqa: E402
 from freegeo.models.mapanything import MapAnything  # noqa: E402
+from freegeo.models.pi3 import Pi3  # noqa: E402
+from freegeo.models.spec import NO_REFERENCE  # noqa: E402
 from freegeo.models.transformer import Block  # noqa: E402
 from freegeo.models.vggt import VGGT  # noqa: E402
 from freegeo.types import Features, ViewTokens  # noqa: E402
@@ -26,6 +29,8 @@ FIXTURES = TESTS / "fixtures"
 BUILDERS = {
     "da3": lambda: parity_da3.build(FIXTURES / "da3" / "tiny-mlp"),
     "vggt": lambda: parity_vggt.build(FIXTURES / "vggt" / "tiny-smallvar"),
+    "pi3": lambda: parity_pi3.build_tiny(FIXTURES / "pi3" / "tiny-pi3"),
+    "pi3x": lambda: parity_pi3.build_tiny(FIXTURES / "pi3" / "tiny-pi3x-smallvar"),
     "mapanything": lambda: parity_mapanything.build(FIXTURES / "mapanything" / "tiny-smallvar"),
 }
 LAST, MIDDLE = -1, -2
@@ -47,6 +52,17 @@ def assert_features_close(ours: Features, wanted: Features, tolerance: float = 1
     for layer in wanted.levels:
         for mine, other in zip(ours.levels[layer], wanted.levels[layer], strict=True):
             assert relative_error(mine, other) <= tolerance
+
+
+def layers_of(model) -> tuple[int, ...]:
+    """Layers of blocks; Pi3's losses compare only what comes after them."""
+    return tuple(range(model.config.pairs)) if isinstance(model, Pi3) else model.spec.loss_layers
+
+
+def depth_without_unit(model, features: Features) -> torch.Tensor:
+    """Depth before the factor to metres, which may depend on the views that are decoded together."""
+    found = model.decode(features, want=("depth",))
+    return found.depth_z if found.scale is None else found.depth_z / found.scale[:, :1, None, None]
 
 
 def block_calls(model: nn.Module, call) -> int:
@@ -102,7 +118,8 @@ def test_views_after_the_first_may_come_in_any_order(model):
     assert_features_close(model.aggregate(tokens.select(order)), features.select(order))
     swapped = model.aggregate(tokens.select([1, 0, 2, 3, 4])).select([1, 0, 2, 3, 4])
     last = max(features.levels)
-    assert relative_error(swapped.levels[last][0], features.levels[last][0]) > 1e-4
+    changed = relative_error(swapped.levels[last][0], features.levels[last][0])
+    assert changed <= 1e-5 if model.spec.reference == NO_REFERENCE else changed > 1e-4
 
 
 @torch.no_grad()
@@ -118,25 +135,26 @@ def test_cameras_and_maps_follow_the_order_of_the_views(model):
 @torch.no_grad()
 def test_nothing_above_the_last_layer_asked_for_is_computed(model):
     tokens = model.embed(images(views=3))
-    middle, last = model.spec.loss_layers[MIDDLE], model.spec.loss_layers[LAST]
+    middle, last = layers_of(model)[MIDDLE], layers_of(model)[LAST]
     until_middle = block_calls(model, lambda: model.aggregate(tokens, layers=[middle]))
     until_last = block_calls(model, lambda: model.aggregate(tokens))
-    blocks_per_layer = 2 if isinstance(model, VGGT) else 1
+    blocks_per_layer = 2 if isinstance(model, VGGT | Pi3) else 1
     assert until_last - until_middle == blocks_per_layer * (last - middle)
 
 
 @torch.no_grad()
 def test_layers_asked_for_alone_are_the_same(model):
     tokens = model.embed(images(views=3))
-    middle = model.spec.loss_layers[MIDDLE]
+    middle, last = layers_of(model)[MIDDLE], layers_of(model)[LAST]
     features = model.aggregate(tokens, layers=[middle])
     assert list(features.levels) == [middle]
     patch, special = features.levels[middle]
-    wanted_patch, wanted_special = model.aggregate(tokens).levels[middle]
+    wanted_patch, wanted_special = model.aggregate(tokens, layers=[middle, last]).levels[middle]
     assert torch.equal(patch, wanted_patch) and torch.equal(special, wanted_special)
     rows, columns = features.grid_hw
     assert patch.shape[:3] == (1, 3, rows * columns)
-    assert special.shape[2] == (model.spec.special_tokens if model.camera_token_name else 0)
+    if middle in model.spec.loss_layers:
+        assert special.shape[2] == (model.spec.special_tokens if model.camera_token_name else 0)
 
 
 @torch.no_grad()
@@ -184,8 +202,8 @@ def test_only_what_is_asked_for_is_decoded(model):
 @torch.no_grad()
 def test_chunks_of_dense_maps_join_to_those_of_single_views(model):
     features = model.aggregate(model.embed(images(views=11, height=28, width=14)))
-    together = model.decode(features, want=("depth",)).depth_z
-    alone = torch.cat([model.decode(features.select([i]), want=("depth",)).depth_z for i in range(11)], dim=1)
+    together = depth_without_unit(model, features)
+    alone = torch.cat([depth_without_unit(model, features.select([i])) for i in range(11)], dim=1)
     assert relative_error(together, alone) <= 1e-5
 
 
@@ -203,7 +221,8 @@ def test_recomputing_blocks_changes_neither_features_nor_gradients(model):
     for recompute in (False, True):
         cross_view.recompute = recompute
         token.requires_grad_(True).grad = None
-        loss = model.aggregate(tokens).levels[model.spec.loss_layers[LAST]][0].square().mean()
+        last = model.spec.loss_layers[LAST]
+        loss = model.aggregate(tokens, layers=[last]).levels[last][0].square().mean()
         loss.backward()
         results.append((loss.detach(), token.grad.clone()))
     cross_view.recompute = False

@@ -39,8 +39,8 @@ WIDE = 4
 TRIPLET_ARRAYS, EDGE_ARRAYS = 13, 3
 """Float64 arrays that exist at the same time while the angle terms are computed: with one number per triplet, and with
 one vector per reference and anchor."""
-WIDEST_LEVELS = 4
-"""Levels that the dense heads read."""
+DPT_LEVELS = 4
+"""Levels that a DPT head reads."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,15 +332,14 @@ def plan_reconstruction(
     pixels = math.prod(image_hw)
     per_view = (image_hw[0] // spec.patch_size) * (image_hw[1] // spec.patch_size) + shape.special
     maps = 2 * WIDE * pixels  # depth and confidence
-    # Widest moment of the dense head per view: half of its channels and its last layers at image size, and three maps
-    # of all channels at 8 per patch.
-    head = getattr(getattr(model.cross_view or model, "config", None), "head_features", 256)
-    head_bytes = int(WIDE * pixels * (head / 2 + 48 + 3 * head * (8 / spec.patch_size) ** 2))
+    part = model.cross_view or model
+    head_bytes = int(WIDE * pixels * (part.peak_channels or _dpt_channels(part)))
     passing, copies = shape.passing(compute, with_adapter=False), shape.half_copies(compute)
 
     def parts(count: int) -> Parts:
         tokens = count * per_view
-        features = shape.features(tokens, WIDEST_LEVELS)
+        read = part.read_channels
+        features = shape.features(tokens, DPT_LEVELS) if read is None else WIDE * tokens * read
         stages = {
             "aggregating": shape.token_bytes(2 * tokens) + copies + features + tokens * passing,
             "decoding": features + count * maps + min(count, 8) * head_bytes,
@@ -368,6 +367,15 @@ def plan_reconstruction(
             f"{total(views) / 1e9:.1f} GB and {budget / 1e9:.1f} GB are free: {advice}."
         )
     return parts(views), fitting
+
+
+def _dpt_channels(model: ReconstructionModel) -> float:
+    """Return how many numbers for each pixel of a view a DPT head holds at its widest moment.
+
+    That is half of its channels and its last layers at image size, and three maps of all channels at 8 per patch.
+    """
+    head = getattr(getattr(model, "config", None), "head_features", 256)
+    return head / 2 + 48 + 3 * head * (8 / model.spec.patch_size) ** 2
 
 
 def available(device: torch.device, model: ReconstructionModel) -> int:

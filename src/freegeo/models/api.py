@@ -38,6 +38,13 @@ class ReconstructionModel(nn.Module, ABC):
     feature_channels: int | None = None
     """Channels of the features at `spec.loss_layers`; None: twice the width, where two blocks' outputs are joined."""
 
+    read_channels: int | None = None
+    """Channels of a token that `decode` reads, of all levels together; None: those of four levels, with their copies.
+    The memory planner counts them, and the next."""
+    peak_channels: float | None = None
+    """Numbers for each pixel of a view that `decode` holds at its widest moment, besides what it reads and returns;
+    None: those of a DPT head."""
+
     @abstractmethod
     def preprocess(
         self, photos: Sequence[PhotoLike], *, mixed: Mixed = MIXED, process_res: int | None = None

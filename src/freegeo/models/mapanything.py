@@ -220,6 +220,8 @@ class MapAnything(ReconstructionModel):
         super().__init__()
         self.config, self.spec = config, spec
         self.feature_channels = width = config.width
+        # Three maps of half of the channels at image size, and one of all at 8 per patch.
+        self.peak_channels = config.head_features * (1.5 + (8 / config.patch_size) ** 2)
         self.encoder = nn.ModuleDict({"model": ImageEncoder(config)})
         self.ray_dirs_encoder, self.depth_encoder = (
             DenseEncoder(channels, config.dense_encoder, width, config.patch_size) for channels in (3, 1)

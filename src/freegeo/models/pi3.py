@@ -33,6 +33,9 @@ from freegeo.types import Features, ImageBatch, Prediction, Priors, ViewTokens
 EPS = 1e-6
 """Of the norms of all blocks; those of queries and keys have their own."""
 
+FIT_ARRAYS = 16
+"""Numbers for each pixel of a view while its intrinsics are found."""
+
 
 class HeadDecoder(nn.Module):
     """Further blocks that read the features of a view, registers included, for one of the heads."""
@@ -130,7 +133,10 @@ class Pi3(ReconstructionModel):
     def __init__(self, config: Pi3Config, spec: ModelSpec):
         super().__init__()
         self.config, self.spec = config, spec
-        self.feature_channels = config.head_width
+        self.feature_channels, self.read_channels = config.head_width, config.channels
+        # A block of a decoder, the feed-forward layer of which is four times as wide, beside what it reads; or the fit
+        # of the intrinsics.
+        self.peak_channels = max((2 * config.channels + 12 * config.head_width) / config.patch_size**2, FIT_ARRAYS)
         self.encoder = self._encoder()
         self.register_token = nn.Parameter(torch.zeros(1, 1, config.registers, config.width))
         self.decoder = nn.ModuleList(
@@ -258,14 +264,16 @@ class Pi3(ReconstructionModel):
             return self._prediction(found, self._metric(features), want)
 
     def _read(self, chunk: Sequence[Tensor], features: Features, want: Collection[Want]) -> dict[str, Tensor]:
-        """Return local points (V, H, W, 3), the logit of their confidence, and cameras, of a few views."""
+        """Return local points (V, H, W, 3) and their confidence, and cameras, of a few views."""
         tokens_VNC = torch.cat(list(chunk), dim=1)
         special, grid_hw = self.config.registers, features.grid_hw
         maps = [
             head(decoder(tokens_VNC, grid_hw)[:, special:], grid_hw)
             for decoder, head in ((self.point_decoder, self.point_head), (self.conf_decoder, self.conf_head))
         ]
-        found = {"points": local_points(maps[0], self.largest_log_depth), "logit": maps[1][:, 0]}
+        found = {"points": local_points(maps[0], self.largest_log_depth), "conf": confidence(maps[1][:, 0])}
+        if "cameras" in want:
+            found["K"] = K_from_local_points(found["points"], maps[1][:, 0].sigmoid())
         if {"cameras", "points"} & set(want):
             camera = self.camera_head(self.camera_decoder(tokens_VNC, grid_hw)[:, special:])
             found["T_world_cam"] = camera_to_world(*camera)
@@ -276,11 +284,8 @@ class Pi3(ReconstructionModel):
         return None
 
     def _prediction(self, found: dict[str, Tensor], metric_B: Tensor | None, want: Collection[Want]) -> Prediction:
-        points, conf = found["points"], confidence(found["logit"])
-        maps: dict[str, Tensor] = {}
-        if "cameras" in want:
-            maps["K"] = K_from_local_points(points, found["logit"].sigmoid())
-        T_world_cam = found.get("T_world_cam")
+        points, conf, T_world_cam = found["points"], found["conf"], found.get("T_world_cam")
+        maps = {"K": found["K"]} if "cameras" in want else {}
         if metric_B is not None:
             points = points * metric_B[:, None, None, None, None]
             maps["scale"] = torch.stack((metric_B, torch.full_like(metric_B, torch.nan)), dim=-1)
