@@ -34,6 +34,7 @@ from freegeo.posed import (
     known_cameras,
     priors_of,
     told,
+    told_of,
     undistorted_masks,
     with_known_cameras,
     with_measured_depth,
@@ -297,6 +298,10 @@ def test_a_model_that_takes_parts_says_which_ones(photos):
 
     all_but_first = range(1, VIEWS)
     alone = without_poses(*all_but_first)
+    # A chunk is told its part of what the sequence can be told, whatever is known of its own first photo.
+    whole, _ = told(without_poses(0), batch, model.spec)
+    chunk, said = told_of(known.select([1, 2]), whole.select([1, 2]), model.spec)
+    assert chunk.T_cam_world is None and said.endswith("a file: intrinsics of 2 photos.")
     cases = [
         (known, True, "is told the cameras of a file."),
         (without_poses(2), True, f"a file: poses of {VIEWS - 1} and intrinsics of {VIEWS} photos."),

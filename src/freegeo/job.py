@@ -387,11 +387,15 @@ class Job:
                 matches = scene_matches(self.photos, predicted, store, device=device)
                 posed = with_measured_depth(posed, self.known, matches)
             predicted = posed.result
-            about["known_cameras"] = {**posed.about, "model": told(self.known, self.batch, self.spec)[1]}
+            about["known_cameras"] = {**posed.about, "model": self.said_of_known()}
         if self.one_camera:
             assert self.photos is not None
             predicted, about["one_camera"] = with_one_camera(predicted, self.photos, self.known)
         return predicted, about
+
+    def said_of_known(self) -> str | None:
+        """Return what is said of known cameras that the model is told, or not told; None without any."""
+        return told(self.known, self.batch, self.spec)[1]
 
     def _in_metres(self, result: Reconstruction, tracks: Tracks | None = None) -> tuple[Reconstruction, Tracks | None]:
         """Bring a result, and points measured in it, to metres where that is asked for."""

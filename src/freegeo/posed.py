@@ -137,9 +137,12 @@ def priors_of(known: KnownCameras, batch: ImageBatch) -> Priors:
 
 def told(known: KnownCameras | None, batch: ImageBatch, spec: ModelSpec) -> tuple[Priors | None, str | None]:
     """Return what a model is told of known cameras, and what to say about that; (None, None) without any."""
-    if known is None:
-        return None, None
-    priors, left_out = usable(priors_of(known, batch), spec)
+    return (None, None) if known is None else told_of(known, priors_of(known, batch), spec)
+
+
+def told_of(known: KnownCameras, found: Priors, spec: ModelSpec) -> tuple[Priors | None, str]:
+    """Return what a model is told of priors that were made of known cameras, and what to say about that."""
+    priors, left_out = usable(found, spec)
     if priors is None:
         return None, f"{left_out} The cameras of {known.source} have no part in its prediction."
     sentence = f"{spec.name} is told the cameras of {known.source}{_parts_of(priors)}."

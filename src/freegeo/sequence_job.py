@@ -50,7 +50,7 @@ from freegeo.job import (
 )
 from freegeo.metres import FEWEST_POSITIONS, Gps, scale_to_metres
 from freegeo.pipeline import capital, judge_by_photos
-from freegeo.posed import doubt_focal_length, with_one_camera
+from freegeo.posed import doubt_focal_length, told_of, with_one_camera
 from freegeo.report.page import write_report
 from freegeo.run_folder import Part
 from freegeo.sequence.assembly import CONTRADICTED, Assembly, Seams, assemble, broken, seams_between
@@ -643,6 +643,12 @@ class ChunkJob(Job):
     @property
     def _attached(self) -> Adapter | None:
         return self.whole._attached
+
+    def said_of_known(self) -> str | None:
+        """Return what is said of known cameras: a chunk is told its part of what the whole sequence can be told."""
+        if self.known is None or self.priors is None:
+            return self.whole.said_of_known()
+        return told_of(self.known, self.priors, self.spec)[1]
 
     def make(self) -> Computed:
         """Write the result of the chunk; an adapter that was trained is judged already."""

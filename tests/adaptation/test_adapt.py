@@ -830,6 +830,15 @@ def test_a_term_of_one_s_own_is_added_to_the_loss_and_named(tmp_path):
     assert json.loads((tmp_path / "freegeo.json").read_text())["own_loss"].endswith("far_from_teacher")
 
 
+def test_a_term_of_one_s_own_gets_nothing_of_the_student_as_the_teacher_s():
+    def term(student, teacher):
+        assert student.extra and not teacher.extra
+        return student.levels[max(student.levels)][0].square().mean()
+
+    model = tiny_mapanything()
+    adapt(model, [noise_scene(4)], quick(model, steps=1), seed=1, own_loss=term)
+
+
 @pytest.mark.parametrize(
     ("term", "words"),
     [

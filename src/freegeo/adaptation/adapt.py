@@ -415,7 +415,7 @@ def _student_loss(run: _Run, adapter: Adapter, visit: Visit, sample: Sample) -> 
         losses.append(recipe.cameras * _camera_loss(adapter.model, student, sample.student_targets()))
         terms["cameras"] = losses[-1].detach()
     if run.own_loss is not None:
-        losses.append(_checked(run.own_loss(student, replace(student, levels=teacher))))
+        losses.append(_checked(run.own_loss(student, replace(student, levels=teacher, extra={}))))
         terms["own"] = losses[-1].detach()
     return torch.stack(losses).sum(), terms
 

@@ -96,10 +96,7 @@ def mean_rotation(matrices: Tensor, weights: Tensor | None = None) -> Tensor:
         mean = matrices.mean(dim=-3)
     else:
         mean = (weights[..., None, None] * matrices).sum(dim=-3) / weights.sum(-1)[..., None, None]
-    U, _, Vh = torch.linalg.svd(mean)
-    signs = torch.ones_like(U[..., 0, :])
-    signs[..., 2] = torch.linalg.det(U @ Vh).sign()
-    return (U * signs[..., None, :]) @ Vh
+    return closest_rotation(mean)
 
 
 def rotate(matrix: Tensor, vectors: Tensor) -> Tensor:

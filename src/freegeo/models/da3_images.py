@@ -10,7 +10,7 @@ from torch import Tensor
 
 from freegeo.errors import UserError
 from freegeo.geometry.resample import resize_area, resize_cubic
-from freegeo.models.images import Size, images_of_one_size, require_a_patch
+from freegeo.models.images import Size, images_of_one_size, planned, require_a_patch
 from freegeo.models.spec import MIXED, Mixed
 from freegeo.types import ImageBatch, PhotoLike
 
@@ -70,15 +70,8 @@ def _resized(pixels_HW3: Tensor, size: Size, step: Step) -> Tensor:
 
 def preprocess(photos: Sequence[PhotoLike], *, side: int, patch: int, mixed: Mixed = MIXED) -> ImageBatch:
     """Read and resize photos; upstream cuts photos that end up with different sizes to the smallest sides."""
-    plans = [_plan_photo(photo, side, patch) for photo in photos]
+    plans = planned(photos, lambda size: plan_size(size, side, patch))
     return images_of_one_size(
         photos, [plan.final for plan in plans], lambda pixels, number: apply_plan(pixels, plans[number]), mixed=mixed,
         upstream="smallest",
     )  # fmt: skip
-
-
-def _plan_photo(photo: PhotoLike, side: int, patch: int) -> SizePlan:
-    try:
-        return plan_size(photo.size_hw, side, patch)
-    except UserError as error:
-        raise UserError(f"{photo.name}: {error}") from None

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ logger = logging.getLogger(__name__)
 
 Size = tuple[int, int]
 """Height and width."""
+Plan = TypeVar("Plan")
 _AT_A_TIME = 16
 """Photos that are held in memory while all of many are looked at."""
 
@@ -287,6 +288,17 @@ def require_a_patch(photo: Size, patch: int) -> None:
             f"a photo of {photo[1]} x {photo[0]} pixels is too small or too narrow: the model reads patches of "
             f"{patch} x {patch} pixels. Use a larger photo or crop it to a less extreme aspect."
         )
+
+
+def planned(photos: Sequence[PhotoLike], plan: Callable[[Size], Plan]) -> list[Plan]:
+    """Return the plan of each photo, made from its size; the UserError of one that cannot be used names it."""
+    found = []
+    for photo in photos:
+        try:
+            found.append(plan(photo.size_hw))
+        except UserError as error:
+            raise UserError(f"{photo.name}: {error}") from None
+    return found
 
 
 def images_of_one_size(

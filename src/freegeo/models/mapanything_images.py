@@ -11,8 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from freegeo.errors import UserError
-from freegeo.models.images import WHITE, Size, SizeOnly, common_size, require_a_patch
+from freegeo.models.images import WHITE, Size, SizeOnly, common_size, planned, require_a_patch
 from freegeo.models.spec import MIXED, Mixed
 from freegeo.types import ImageBatch, PhotoLike
 
@@ -74,13 +73,7 @@ def apply_plan(pixels_HW3: np.ndarray, plan: SizePlan) -> Tensor:
 
 def preprocess(photos: Sequence[PhotoLike], *, side: int, patch: int, mixed: Mixed = MIXED) -> ImageBatch:
     """Read photos at one size; upstream's is that of their mean aspect, which cuts the ends of those that differ."""
-    sizes = []
-    for photo in photos:
-        try:
-            require_a_patch(photo.size_hw, patch)
-        except UserError as error:
-            raise UserError(f"{photo.name}: {error}") from None
-        sizes.append(size_for(photo.size_hw[1] / photo.size_hw[0], side, patch))
+    sizes = planned(photos, lambda size: _own_size(size, side, patch))
     common = _common([photo.size_hw for photo in photos], sizes, side, patch, mixed)
     images, offsets, scales = [], [], []
     shown = [(photo, size) for photo, size in zip(photos, sizes, strict=True) if not isinstance(photo, SizeOnly)]
@@ -100,6 +93,12 @@ def preprocess(photos: Sequence[PhotoLike], *, side: int, patch: int, mixed: Mix
         scale_xy=torch.tensor(scales, dtype=torch.float64),
         offset_xy=torch.tensor(offsets, dtype=torch.float64),
     )
+
+
+def _own_size(photo: Size, side: int, patch: int) -> Size:
+    """Return the size for one photo alone; UserError when it would not fill a patch."""
+    require_a_patch(photo, patch)
+    return size_for(photo[1] / photo[0], side, patch)
 
 
 def _common(photos: Sequence[Size], sizes: Sequence[Size], side: int, patch: int, mixed: Mixed) -> Size:

@@ -10,8 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from freegeo.errors import UserError
-from freegeo.models.images import Size, images_of_one_size, require_a_patch
+from freegeo.models.images import Size, images_of_one_size, planned, require_a_patch
 from freegeo.models.spec import MIXED, Mixed
 from freegeo.types import ImageBatch, PhotoLike
 
@@ -37,18 +36,15 @@ def resize(pixels_HW3: Tensor, size: Size) -> Tensor:
 
 def preprocess(photos: Sequence[PhotoLike], *, patch: int, pixels: int, mixed: Mixed = MIXED) -> ImageBatch:
     """Read and resize photos; upstream squashes all of them to the size that suits the first one."""
+    sizes = planned(photos, lambda size: _own_size(size, patch, pixels))
     if mixed == "upstream":
-        sizes = [_plan_photo(photos[0], patch, pixels)] * len(photos)
-    else:
-        sizes = [_plan_photo(photo, patch, pixels) for photo in photos]
+        sizes = sizes[:1] * len(photos)
     return images_of_one_size(
         photos, sizes, lambda image, number: resize(image, sizes[number]), mixed=mixed, upstream="largest"
     )
 
 
-def _plan_photo(photo: PhotoLike, patch: int, pixels: int) -> Size:
-    try:
-        require_a_patch(photo.size_hw, patch)
-    except UserError as error:
-        raise UserError(f"{photo.name}: {error}") from None
-    return plan_size(photo.size_hw, patch, pixels)
+def _own_size(photo: Size, patch: int, pixels: int) -> Size:
+    """Return the size for one photo alone; UserError when it would not fill a patch."""
+    require_a_patch(photo, patch)
+    return plan_size(photo, patch, pixels)

@@ -173,7 +173,7 @@ class Pi3X(Pi3):
         # The finest level at image size, as it is, with u and v, and with its border; or a unit of it at 8 per patch,
         # twice as wide inside.
         widest = max(3, 8 * (8 / config.patch_size) ** 2)
-        self.peak_channels = max(self.peak_channels, widest * x.head_channels[-1])
+        self.peak_channels = max(self.peak_channels or 0, widest * x.head_channels[-1])
         self.metric_token = nn.Parameter(torch.zeros(1, 1, config.channels))
         self.metric_decoder = ScaleDecoder(config.channels, x)
         self.metric_head = nn.Linear(x.scale_out, 1)

@@ -9,9 +9,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from freegeo.errors import UserError
 from freegeo.geometry.resample import resize_area, resize_cubic
-from freegeo.models.images import Size, images_of_one_size, require_a_patch
+from freegeo.models.images import Size, images_of_one_size, planned, require_a_patch
 from freegeo.models.spec import MIXED, Mixed
 from freegeo.types import ImageBatch, PhotoLike
 
@@ -40,18 +39,11 @@ def apply_plan(pixels_HW3: Tensor, plan: SizePlan) -> Tensor:
 
 def preprocess(photos: Sequence[PhotoLike], *, side: int, patch: int, mixed: Mixed = MIXED) -> ImageBatch:
     """Read and resize photos; upstream pads photos that end up with different sizes to the largest sides."""
-    plans = [_plan_photo(photo, side, patch) for photo in photos]
+    plans = planned(photos, lambda size: plan_size(size, side, patch))
     return images_of_one_size(
         photos, [plan.resized for plan in plans], lambda pixels, number: apply_plan(pixels, plans[number]), mixed=mixed,
         upstream="largest",
     )  # fmt: skip
-
-
-def _plan_photo(photo: PhotoLike, side: int, patch: int) -> SizePlan:
-    try:
-        return plan_size(photo.size_hw, side, patch)
-    except UserError as error:
-        raise UserError(f"{photo.name}: {error}") from None
 
 
 def _resize_area(pixels_HW3: Tensor, size: Size) -> Tensor:
