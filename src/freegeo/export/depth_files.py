@@ -52,16 +52,15 @@ _LEGEND = """<svg xmlns="http://www.w3.org/2000/svg" width="640" height="72" fon
 
 
 def depth_maps(export: Export) -> Iterator[np.ndarray]:
-    """Yield the depth of each view, (h, w) float32 at the size of the export, 0 where there is none."""
-    r = export.reconstruction
-    valid = r.valid_pixels()
-    if export.masks is not None:
-        valid &= export.masks
-    for view, known in enumerate(valid):
+    """Yield the depth of each view, (h, w) float32 at the size of the export, 0 where there is none.
+
+    FreeGeoError where no view has any.
+    """
+    for view, known in enumerate(export.depth_pixels()):
         if export.depth_size == "photo":
             yield photo_depth(export, view, known)
         else:
-            yield np.where(known, r.depth_z[view], np.float32(0))
+            yield np.where(known, export.reconstruction.depth_z[view], np.float32(0))
 
 
 def photo_depth(export: Export, view: int, known: np.ndarray) -> np.ndarray:
@@ -86,7 +85,6 @@ def _write_maps(
     export: Export, folder: str, suffix: str, about: dict[str, Any], write: Callable[[np.ndarray, Path], None]
 ) -> list[Path]:
     """Write a map of each view, one after the other, and depth.json; returns the files."""
-    export.require_depth()
     place, r = export.folder / folder, export.reconstruction
     maps = dict(zip(r.names, depth_names(r.names, suffix), strict=True))
     paths = [files.inside(place, name) for name in maps.values()]
@@ -103,7 +101,7 @@ def _write_maps(
 def _write_png(export: Export) -> list[Path]:
     from PIL import Image, PngImagePlugin
 
-    scale = max((float(depth.max()) for depth in _model_maps(export)), default=0.0) / LARGEST or 1.0
+    scale = max(float(depth.max()) for depth in _model_maps(export)) / LARGEST
     text = PngImagePlugin.PngInfo()
     text.add_text("depth_scale", repr(scale))
 
