@@ -150,12 +150,12 @@ class Export:
 
         FreeGeoError when there are none.
         """
-        self.require_depth()
         known = self.reconstruction.valid_pixels()
         if self.masks is not None:
             known &= self.masks
-            if not known.any():
-                raise FreeGeoError("no depth is left to write: the masks leave no usable pixel. Check the masks.")
+        if not known.any():
+            self.require_depth()
+            raise FreeGeoError("no depth is left to write: the masks leave no usable pixel. Check the masks.")
         return known
 
     def write(self, format: Format) -> list[Path]:
