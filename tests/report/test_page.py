@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from exact_rooms import room
 from example_results import HOSTILE_NAME, finer_photos, write_example
@@ -300,6 +301,14 @@ def test_the_level_frame_has_the_cameras_up_and_forward():
     down = np.eye(4)[None].repeat(2, 0)
     down[1, :3, :3] = np.diag([-1.0, 1, -1])  # Two cameras back to back have no mean direction.
     assert np.isfinite(scene3d.level_rotation(down)).all()
+
+
+def test_cameras_that_look_down_from_one_side_do_not_tilt_the_scene():
+    turns = Rotation.from_euler("y", np.linspace(-45, 45, 7)[:, None], degrees=True)
+    T = np.eye(4)[None].repeat(7, 0)
+    T[:, :3, :3] = (Rotation.from_euler("x", 40, degrees=True) * turns).as_matrix()
+    up = scene3d.level_rotation(T)[1]
+    assert np.degrees(np.arccos(up @ (0, -1, 0))) < 10, "their mean up is 36 degrees off"
 
 
 def test_colours_follow_one_scale_and_grey_is_invalid():
