@@ -3,7 +3,6 @@
 # Annotations are values here, not text: Gradio looks for `gr.Request` among those of functions inside a function.
 import base64
 import io
-import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -12,7 +11,7 @@ from freegeo.adaptation.recipe import Guard, RecipeName
 from freegeo.data.image_files import UnreadableImageError
 from freegeo.data.photos import evenly_spaced, open_photos
 from freegeo.data.video import is_video
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import UserError
 from freegeo.export.base import DEFAULT_FORMATS
 from freegeo.export.formats import FORMATS
 from freegeo.models import catalog
@@ -26,8 +25,6 @@ from freegeo.webapp.sessions import AWAY_S, Session, Sessions
 
 if TYPE_CHECKING:
     import gradio as gr
-
-logger = logging.getLogger(__name__)
 
 HERE = Path(__file__).parent / "templates"
 TICK_S = 0.7
@@ -53,16 +50,7 @@ RECIPES: tuple[RecipeName, ...] = ("scene", "evidence")
 
 def models() -> list[ModelEntry]:
     """Return the models that can be used; plug-ins that do not work are left out with a warning."""
-    found = []
-    for name in catalog.names():
-        try:
-            found.append(catalog.entry(name))
-        except Exception as error:
-            told = catalog.broken(name, error)
-            if not isinstance(told, FreeGeoError):
-                raise
-            logger.warning("%s", told)
-    return found
+    return catalog.for_each(catalog.entry)
 
 
 def download_of(item: ModelEntry) -> str:
