@@ -115,6 +115,19 @@ def test_folder_replaces_what_was_written_before_and_spares_other_files(tmp_path
     assert (tmp_path / "model" / "deep").exists() != noted
 
 
+def test_what_somebody_else_put_there_is_not_replaced(tmp_path):
+    keep_ledger(tmp_path)
+    for path in (tmp_path / "a.bin", tmp_path / "model" / "a.bin"):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    with pytest.raises(UserError, match="freegeo did not write it"):
+        written_folder(tmp_path / "model", "a.bin", "b.bin")
+    with pytest.raises(UserError, match="freegeo did not write it"), atomic_path(tmp_path / "a.bin") as part:
+        part.write_text("new")
+    assert names_in(tmp_path) == {LEDGER_FILE, "a.bin", "model/a.bin"}
+    assert (tmp_path / "a.bin").read_text() == (tmp_path / "model" / "a.bin").read_text() == "mine"
+
+
 def test_failure_while_a_folder_is_written_keeps_the_old_one(tmp_path):
     keep_ledger(tmp_path)
     written_folder(tmp_path / "model", "a.bin")

@@ -16,7 +16,7 @@ import shutil
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,6 +87,7 @@ def atomic_folder(path: Path) -> Generator[Path]:
         new = sorted(file.relative_to(part) for file in part.rglob("*") if file.is_file())
         for name in new:
             _flush(part / name)
+        _require_not_foreign([path / name for name in new])
         remove_written(path)
         for name in new:
             remove_file(path / name)
@@ -101,6 +102,7 @@ def atomic_folder(path: Path) -> Generator[Path]:
 def _door(path: Path, folder: Path) -> Generator[Path]:
     """Give the temporary path for what will be `path`, and remove it afterwards; `folder` is where files are put."""
     _require_own(path, folder)
+    _require_not_foreign([path])
     # Short, so that it fits wherever the final name does.
     part = path.with_name(f".{path.stem[:40]}.{secrets.token_hex(4)}.part{path.suffix[:20]}")
     try:
@@ -142,6 +144,20 @@ def _require_own(path: Path, folder: Path) -> None:
     owner = _owner(path)
     if owner is not None and path.name not in OWN_FILES and not _is_below(folder, owner):
         raise UserError(f"{path}: leads out of the output folder {owner}. Remove the symbolic link, or the '..'.")
+
+
+def _require_not_foreign(paths: Sequence[Path]) -> None:
+    """Refuse to replace files of an output folder that its ledger does not list: somebody put them there."""
+    there = [path for path in paths if path.is_file() and path.name not in OWN_FILES]
+    owner = _owner(there[0]) if there else None
+    if owner is not None:
+        text = (owner / LEDGER_FILE).read_bytes() if (owner / LEDGER_FILE).is_file() else b""
+        for path in there:
+            if b"\n" + os.fsencode(_entry(path, owner)) + b"\n" not in b"\n" + text:
+                raise UserError(
+                    f"{path}: is there, and freegeo did not write it, so it is not replaced. Choose another folder, or "
+                    "move it away."
+                )
 
 
 def _remove(path: Path) -> None:

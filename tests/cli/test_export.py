@@ -208,7 +208,7 @@ def test_files_beside_a_report_show_its_points(freegeo, out):
 
 @pytest.mark.slow
 def test_the_flight_through_an_adapted_result_shows_the_frozen_one_too(
-    freegeo, photo_folder, tiny, tmp_path, short_flights
+    freegeo, photo_folder, tiny, tmp_path, short_flights, monkeypatch
 ):
     def width(file):
         with av.open(str(file)) as video:
@@ -220,6 +220,14 @@ def test_the_flight_through_an_adapted_result_shows_the_frozen_one_too(
     assert width(out / name) == 2 * 256
     assert freegeo("export", out, "-f", "video", "-o", tmp_path / "again").code == 0
     assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()
+    filters = {}
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "freegeo.export.video.flythrough",
+            lambda *_, before, masks: filters.update(before=before.filters) or iter([np.zeros((48, 64, 3), np.uint8)]),
+        )
+        assert freegeo("export", out, "-f", "video", "-o", tmp_path / "thin", "--drop-share", 0.6).code == 0
+    assert filters["before"].drop_share == 0.6, "both sides are filtered alike"
     assert freegeo("export", out, "-f", "video", "--frozen").code == 0
     assert width(out / "frozen" / name) == 256
 

@@ -156,6 +156,14 @@ def test_pictures_of_one_depth_have_one_colour_in_all_photos(tmp_path):
     assert f"{about['nearest']:.3g}" in texts and f"{about['farthest']:.3g}" in texts
 
 
+def test_masks_that_leave_no_depth_are_told_and_no_file_is_written(tmp_path, caplog):
+    masks = np.zeros(room().depth_z.shape, bool)
+    done = export(room(), tmp_path, DEPTH_FORMATS, masks=masks)
+    assert done.files == [] and list(done.failed) == DEPTH_FORMATS
+    assert caplog.text.count("the masks leave no usable pixel") == len(DEPTH_FORMATS)
+    assert not [path for path in tmp_path.rglob("*") if path.suffix in (".png", ".npy", ".json", ".svg")]
+
+
 def test_depth_at_the_photos_size_needs_the_photos(tmp_path):
     with pytest.raises(UserError, match="interpolated by these, and they are not at hand"):
         export(room(), tmp_path, ["ply", "depth-npy"], depth_size="photo")

@@ -40,6 +40,23 @@ def photos_of(scene):
     ]
 
 
+@pytest.mark.parametrize("name", ["images/photo 0.JPG", "masks/photo 0.png", "depth/photo 0.png", "transforms.json"])
+def test_photos_masks_depth_and_cameras_of_a_data_set_are_not_replaced(tmp_path, name):
+    scene = room()
+    photos = [MemoryPhoto(n, np.zeros((*hw, 3), np.uint8)) for n, hw in zip(scene.names, scene.photo_hw, strict=True)]
+    own = tmp_path / name
+    own.parent.mkdir(exist_ok=True)
+    own.write_text("somebody's own")
+    masks = np.ones(scene.depth_z.shape, bool)
+    for _ in range(2):
+        with pytest.raises(UserError, match="freegeo did not write it"):
+            export(scene, tmp_path, ["nerfstudio", "depth"], photos=photos, masks=masks)
+        assert own.read_text() == "somebody's own"
+    own.unlink()
+    for _ in range(2):
+        assert own in export(scene, tmp_path, ["nerfstudio", "depth"], photos=photos, masks=masks).files
+
+
 def test_every_format_is_written_once_and_points_are_shared(tmp_path, short_flights):
     pytest.importorskip("pycolmap", reason="needs the extra colmap")
     pytest.importorskip("rerun", reason="needs the extra rerun")

@@ -19,7 +19,8 @@ ROOM_UP = np.array([0.0, 0.0, 1.0])
 
 def up_of(scene):
     cloud = cloud_of(scene)
-    return find_up(scene.T_cam_world, cloud.points, point_normals(cloud, scene.depth_z, scene.T_cam_world, scene.K))
+    normals = point_normals(cloud, scene.depth_z, scene.T_cam_world, scene.K, scene.inside())
+    return find_up(scene.T_cam_world, cloud.points, normals)
 
 
 def turned(scene, R):
@@ -66,7 +67,7 @@ def test_the_floor_is_level_in_the_glb_file_however_the_world_lies(tmp_path, see
 def test_photos_that_were_taken_rolled_do_not_count():
     scene = room(8, seed=5)
     cloud = cloud_of(scene)
-    normals = point_normals(cloud, scene.depth_z, scene.T_cam_world, scene.K)
+    normals = point_normals(cloud, scene.depth_z, scene.T_cam_world, scene.K, scene.inside())
     found = find_up(rolled(scene, (0, 1, 0, 0, 2, 0, 3, 0)).T_cam_world, cloud.points, normals)
     assert found is not None
     assert angle_deg(found.direction, ROOM_UP) < 2

@@ -9,13 +9,14 @@ import trimesh
 from PIL import Image
 
 import freegeo
-from exact_rooms import PHOTO_SCALE, room
+from exact_rooms import PHOTO_SCALE, cloud_of, room
 from freegeo.data.photos import MemoryPhoto
 from freegeo.export.formats import export, filter_reconstruction
 from freegeo.export.mesh import fuse, voxel_size
 from freegeo.export.pixels import corner_pixels, masks_for_model
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.fusion.filtering import filter_pixels
+from freegeo.fusion.normals import point_normals
 from freegeo.fusion.settings import FilterSettings
 from freegeo.fusion.tracks import build_tracks
 from freegeo.geometry.camera import project
@@ -48,6 +49,16 @@ def test_the_mask_follows_from_scale_and_offset():
     scene, inside = padded()
     assert (scene.inside() == inside).all()
     assert room().inside().all() and room(crop=7).inside().all(), "a cut photo has no padding"
+
+
+def test_normals_do_not_follow_what_is_in_the_padding():
+    scene, inside = padded()
+    cloud = cloud_of(scene, keep=inside, drop_share=0.0, drop_flying=False)
+    # Close enough to the photo's edge to be taken for its surface.
+    bent = replace(scene, depth_z=np.where(inside, scene.depth_z, 1.01 * scene.depth_z))
+    blank = replace(scene, depth_z=np.where(inside, scene.depth_z, np.nan))
+    of_bent, of_blank = (point_normals(cloud, s.depth_z, *s.cameras(), s.inside()) for s in (bent, blank))
+    np.testing.assert_array_equal(of_bent, of_blank)
 
 
 def test_filters_count_padding_apart_and_keep_none_of_it():

@@ -18,7 +18,7 @@ def write_scene(scene, cloud, path):
 
 
 def normals_of(scene, cloud):
-    return point_normals(cloud, scene.depth_z, scene.T_cam_world, scene.K)
+    return point_normals(cloud, scene.depth_z, scene.T_cam_world, scene.K, scene.inside())
 
 
 def test_points_project_back_to_their_pixels_and_carry_their_colours():

@@ -10,10 +10,13 @@ from scipy.spatial.transform import Rotation
 from exact_rooms import room
 from freegeo.errors import FreeGeoError
 from freegeo.export import video
-from freegeo.export.base import Before
+from freegeo.export.base import KEPT_NAME, Before
 from freegeo.export.flight import BACKGROUND, WINDOW, Painter, plan_flight
 from freegeo.export.formats import export
+from freegeo.export.kept import save_kept
 from freegeo.export.video import flythrough, picture_size, write_video
+from freegeo.fusion.filtering import FilterReport
+from freegeo.fusion.settings import FilterSettings
 
 
 def everything(scene):
@@ -153,6 +156,26 @@ def test_before_and_after_show_the_same_place_side_by_side(tmp_path, short_fligh
     same = next(flythrough(scene, everything(scene), before=Before(folder=tmp_path / "same")))
     np.testing.assert_array_equal(same, alone, err_msg="nothing is shown twice")
     np.testing.assert_array_equal(right[below], alone[below])
+
+
+def test_before_has_the_filters_and_masks_of_after(tmp_path, short_flights):
+    scene = room(3, (48, 64))
+    earlier = moved(scene)
+    earlier.save(tmp_path / "frozen")
+    masks = everything(scene)
+    masks[:, :, 32:] = False
+    save_kept(tmp_path / "frozen", (everything(scene), FilterReport(pixels=masks.size, removed={}, tolerance=None)))
+    (_, width), _ = picture_size(scene.image_hw)
+
+    def drawn(**settings):
+        before = Before(folder=tmp_path / "frozen", **settings)
+        left = next(flythrough(scene, masks, before=before, masks=masks))[:, :width]
+        return (left != BACKGROUND).any(axis=-1).mean()
+
+    few = FilterSettings(drop_share=0, flying=False, multi_view=False)
+    assert drawn(filters=few) < 0.8 * drawn(), "as asked for now, not as stored"
+    (tmp_path / "frozen" / KEPT_NAME).unlink()
+    assert drawn() < 0.8
 
 
 def test_a_single_photo_is_seen_from_a_small_circle(short_flights):

@@ -8,11 +8,13 @@ import re
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from exact_rooms import room
 from example_results import HOSTILE_NAME, finer_photos, write_example
 from example_sequences import ring
 from freegeo import files
+from freegeo.export.colours import INVALID_GREY, log_colours, log_range
 from freegeo.export.kept import save_kept
 from freegeo.export.reconstruction import METRIC_MODEL, Reconstruction, Scale
 from freegeo.fusion.filtering import FilterReport
@@ -301,15 +303,23 @@ def test_the_level_frame_has_the_cameras_up_and_forward():
     assert np.isfinite(scene3d.level_rotation(down)).all()
 
 
+def test_cameras_that_look_down_from_one_side_do_not_tilt_the_scene():
+    turns = Rotation.from_euler("y", np.linspace(-45, 45, 7)[:, None], degrees=True)
+    T = np.eye(4)[None].repeat(7, 0)
+    T[:, :3, :3] = (Rotation.from_euler("x", 40, degrees=True) * turns).as_matrix()
+    up = scene3d.level_rotation(T)[1]
+    assert np.degrees(np.arccos(up @ (0, -1, 0))) < 10, "their mean up is 36 degrees off"
+
+
 def test_colours_follow_one_scale_and_grey_is_invalid():
     values = np.array([[1.0, 10.0, 100.0, np.nan, -1.0]])
-    colours = figures.log_colours(values, (1, 100), "gray")
+    colours = log_colours(values, (1, 100), "gray")
     assert colours[0, 0, 0] == 0
     assert colours[0, 2, 0] == 255
     assert abs(int(colours[0, 1, 0]) - 128) <= 2
-    assert (colours[0, 3:] == figures.INVALID_GREY).all()
-    assert figures.log_range([np.zeros((2, 2))]) == (1.0, 2.0)
-    low, high = figures.log_range([np.full((2, 2), 3.0)])
+    assert (colours[0, 3:] == INVALID_GREY).all()
+    assert log_range(lambda: [np.zeros((2, 2))]) == (1.0, 2.0)
+    low, high = log_range(lambda: [np.full((2, 2), 3.0)])
     assert low < 3 < high
 
 

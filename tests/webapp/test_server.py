@@ -11,6 +11,7 @@ from freegeo import report
 from freegeo.errors import UserError
 from freegeo.lock import LOCK_FILE
 from freegeo.models import catalog
+from freegeo.report.contents import contents
 from freegeo.report.result import SUMMARY_NAME
 from freegeo.webapp import page, server
 from freegeo.webapp.runs import PHOTOS, RESULT, Run
@@ -79,6 +80,24 @@ def test_the_zip_file_holds_the_result_and_nothing_else(finished):
     assert server.zipped(finished).stat().st_mtime_ns == written
 
 
+def test_all_files_that_the_report_links_to_are_served_and_nothing_else(finished, tmp_path):
+    result = tmp_path / RESULT
+    (tmp_path / "secret.txt").touch()
+    (result / "outside").symlink_to(tmp_path)
+    for name in ("report.html", "frozen/prediction.npz"):
+        assert server.result_file(finished, name) == result / name
+    hidden = (".freegeo-run.json", LOCK_FILE, "frozen/../.freegeo-run.json", "link", "outside/secret.txt")
+    beyond = ("../secret.txt", "frozen/../../secret.txt", str(tmp_path / "secret.txt"))
+    for name in (*hidden, *beyond, "frozen/", "", "no", "x" * 5000, "\0"):
+        assert server.result_file(finished, name) is None, name
+
+
+def test_every_file_of_a_result_is_explained_as_in_the_report(finished):
+    listed = {file["name"]: file["about"] for file in page.files(finished)}
+    for name in ("report.html", "prediction.npz", "reconstruction.json"):
+        assert listed[name] == contents()[name]
+
+
 def test_the_verdict_comes_first(finished):
     text = page.result(finished, kept=False)
     assert "<b>Adaptation: yes.</b> The matches fit better." in text
@@ -140,6 +159,6 @@ def test_sentences_begin_with_a_capital_and_names_of_files_stay_as_they_are():
 
 def test_numbers_are_whole_or_left_out():
     assert [page.whole_number(text, page.STEPS) for text in ("", " 7 ", "100")] == [None, 7, 100]
-    for text in ("0", "-1", "1.5", "many", "--steps"):
+    for text in ("0", "-1", "1.5", "many", "--steps", "9" * 5000):
         with pytest.raises(UserError, match=r"Training steps \(--steps\) is a whole number from 1 on"):
             page.whole_number(text, page.STEPS)

@@ -1,5 +1,6 @@
 """Sessions of the web app: uploads and runs of one page each, and folders that do not outlive them."""
 
+import errno
 import sys
 import tempfile
 import time
@@ -9,7 +10,8 @@ import pytest
 
 from freegeo.errors import UserError
 from freegeo.webapp import sessions as module
-from freegeo.webapp.runs import PHOTOS, Choice
+from freegeo.webapp.runs import PHOTOS, RESULT, Choice
+from freegeo.webapp.server import zipped
 from freegeo.webapp.sessions import AWAY_S, IDLE_S, PREFIX, Sessions
 
 TINY = Choice(model="freegeo-tiny")
@@ -82,6 +84,34 @@ def test_the_same_inputs_continue_and_others_begin_anew(sessions):
     other = sessions.start(page, Choice(model="freegeo-tiny", adapt=False))
     assert other.folder != first.folder
     assert not first.folder.exists()
+
+
+def test_a_zip_file_is_not_that_of_the_run_before(sessions):
+    page = sessions.session("a")
+    page.uploads = uploaded(sessions, "a.jpg")
+    first = sessions.start(page, TINY)
+    (first.folder / RESULT).mkdir()
+    (first.folder / RESULT / "a.txt").touch()
+    old = zipped(first)
+    sessions.queue.cancel(first)
+    sessions.queue.wait_for(first, 20)
+    again = sessions.start(page, TINY)
+    assert again.folder == first.folder and not old.exists()
+
+
+def test_a_full_disk_is_told_and_leaves_nothing(sessions, monkeypatch):
+    page = sessions.session("a")
+    page.uploads = uploaded(sessions, "a.jpg")
+    there = set(sessions.folder.iterdir())
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(module.os, "link", full)
+    monkeypatch.setattr(module.shutil, "copyfile", full)
+    with pytest.raises(UserError, match=r"cannot be stored .*No space left"):
+        sessions.start(page, TINY)
+    assert page.run is None and set(sessions.folder.iterdir()) == there
 
 
 def test_results_open_by_their_token_alone_and_when_they_are_finished(sessions):

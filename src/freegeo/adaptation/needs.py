@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -12,13 +11,10 @@ from freegeo.adaptation.memory import Footprint, plan_reconstruction
 from freegeo.adaptation.recipe import SEED, scene
 from freegeo.adaptation.samples import SceneImages
 from freegeo.adaptation.views import schedule
-from freegeo.errors import FreeGeoError
 from freegeo.models import catalog
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
 from freegeo.models.spec import ModelEntry
-
-logger = logging.getLogger(__name__)
 
 VIEWS = (8, 32, 100)
 """Numbers of photos whose reconstruction is planned."""
@@ -47,16 +43,7 @@ class ModelNeeds:
 
 def model_needs() -> list[ModelNeeds]:
     """Return what every model needs that can be loaded; one that is broken, such as a plug-in, is a warning."""
-    found = []
-    for name in catalog.names():
-        try:
-            found.append(needs_of(name))
-        except Exception as error:
-            told = catalog.broken(name, error)
-            if not isinstance(told, FreeGeoError):
-                raise
-            logger.warning("%s", told)
-    return found
+    return catalog.for_each(needs_of)
 
 
 def needs_of(name: str) -> ModelNeeds:

@@ -200,7 +200,7 @@ def _offered(one: Offer) -> str:
 
 
 def _require_yes(yes: bool) -> None:
-    """Return when the user agrees; UserError when there is nobody to ask, FreeGeoError when the answer is no."""
+    """Return when the user agrees; UserError when there is nobody to ask, or when the answer is no."""
     import sys
 
     if yes:

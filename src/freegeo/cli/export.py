@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -85,9 +86,11 @@ def export(
                 if target.resolve() == run:
                     require_points_of_report(target, filtered[0])
         summary = stored_summary(run or home)
-        before = (
-            before_adaptation(home, summary["refinement"]) if home.resolve() == run and summary.get("adapter") else None
-        )
+        before = None
+        if home.resolve() == run and summary.get("adapter"):
+            before = before_adaptation(home, summary.get("refinement"))
+        if before is not None and filters is not None:
+            before = replace(before, filters=filters.settings())
         place = result_folder(target) or target
         with nullcontext() if place == run else locked(place):
             remove_parts(place)

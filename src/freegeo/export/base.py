@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.fusion.filtering import FilterReport
     from freegeo.fusion.points import PointCloud
+    from freegeo.fusion.settings import FilterSettings
     from freegeo.fusion.tracks import Tracks
     from freegeo.types import PhotoLike
 
@@ -82,6 +83,8 @@ class Before:
     """What it is called, as in the report."""
     result_label: str = "adapted"
     """What the result is called."""
+    filters: FilterSettings | None = None
+    """By which its points are chosen; None: those that its folder says."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,6 +144,19 @@ class Export:
             raise FreeGeoError(
                 "no depth of the prediction is usable (none is finite and positive). Check the weights and the adapter."
             )
+
+    def depth_pixels(self) -> np.ndarray:
+        """Return the pixels (S, H, W) bool whose depth is written: usable, and within the masks but not the filters.
+
+        FreeGeoError when there are none.
+        """
+        known = self.reconstruction.valid_pixels()
+        if self.masks is not None:
+            known &= self.masks
+        if not known.any():
+            self.require_depth()
+            raise FreeGeoError("no depth is left to write: the masks leave no usable pixel. Check the masks.")
+        return known
 
     def write(self, format: Format) -> list[Path]:
         """Write a format, once, and return its files."""

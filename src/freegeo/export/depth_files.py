@@ -21,18 +21,15 @@ import numpy as np
 from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.base import Export, Format
+from freegeo.export.colours import DEPTH_MAP, colour_table, log_colours, log_range
 from freegeo.export.photos import check_names, new_names, pixels_of
 from freegeo.export.reconstruction import Reconstruction
 
 logger = logging.getLogger(__name__)
 
 LARGEST = 65535
-COLOURS = "viridis_r"
-"""Colour map of the pictures, by its name in matplotlib; the report has the same."""
-NO_DEPTH_GREY = 128
 CHANNEL = "Y"
 """Channel of the EXR files: luminance, which OpenCV and Blender read as one grey image."""
-_RANGE = (0.02, 0.98)
 _LIMITS = "Filters of points (confidence, flying pixels, other views) are not applied."
 _NOTHING = "no valid depth, or outside the masks."
 _VALUES = f"depth along the optical axis; 0: {_NOTHING} {_LIMITS}"
@@ -52,16 +49,15 @@ _LEGEND = """<svg xmlns="http://www.w3.org/2000/svg" width="640" height="72" fon
 
 
 def depth_maps(export: Export) -> Iterator[np.ndarray]:
-    """Yield the depth of each view, (h, w) float32 at the size of the export, 0 where there is none."""
-    r = export.reconstruction
-    valid = r.valid_pixels()
-    if export.masks is not None:
-        valid &= export.masks
-    for view, known in enumerate(valid):
+    """Yield the depth of each view, (h, w) float32 at the size of the export, 0 where there is none.
+
+    FreeGeoError where no view has any.
+    """
+    for view, known in enumerate(export.depth_pixels()):
         if export.depth_size == "photo":
             yield photo_depth(export, view, known)
         else:
-            yield np.where(known, r.depth_z[view], np.float32(0))
+            yield np.where(known, export.reconstruction.depth_z[view], np.float32(0))
 
 
 def photo_depth(export: Export, view: int, known: np.ndarray) -> np.ndarray:
@@ -86,7 +82,6 @@ def _write_maps(
     export: Export, folder: str, suffix: str, about: dict[str, Any], write: Callable[[np.ndarray, Path], None]
 ) -> list[Path]:
     """Write a map of each view, one after the other, and depth.json; returns the files."""
-    export.require_depth()
     place, r = export.folder / folder, export.reconstruction
     maps = dict(zip(r.names, depth_names(r.names, suffix), strict=True))
     paths = [files.inside(place, name) for name in maps.values()]
@@ -103,7 +98,7 @@ def _write_maps(
 def _write_png(export: Export) -> list[Path]:
     from PIL import Image, PngImagePlugin
 
-    scale = max((float(depth.max()) for depth in _model_maps(export)), default=0.0) / LARGEST or 1.0
+    scale = max(float(depth.max()) for depth in _model_maps(export)) / LARGEST
     text = PngImagePlugin.PngInfo()
     text.add_text("depth_scale", repr(scale))
 
@@ -124,33 +119,26 @@ def _model_maps(export: Export) -> Iterator[np.ndarray]:
 
 
 def _write_pictures(export: Export) -> list[Path]:
-    from matplotlib import colormaps
     from PIL import Image
 
-    from freegeo.fusion.quantile import quantile
-
-    near, far = (float(quantile(lambda: (d[d > 0] for d in _model_maps(export)), share)) for share in _RANGE)
-    if not far > near:
-        near, far = near / 1.05, far * 1.05
-    table = (colormaps[COLOURS](np.linspace(0, 1, 256))[:, :3] * 255).round().astype(np.uint8)
+    near, far = log_range(lambda: _model_maps(export))
 
     def write(depth: np.ndarray, path: Path) -> None:
-        share = np.log(np.clip(depth, near, far) / near) / np.log(far / near)
-        pixels = np.where(depth[..., None] > 0, table[(share * 255).astype(np.uint8)], np.uint8(NO_DEPTH_GREY))
-        Image.fromarray(pixels).save(path, compress_level=1)
+        Image.fromarray(log_colours(depth, (near, far), DEPTH_MAP)).save(path, compress_level=1)
 
     about = {
-        "nearest": near, "farthest": far, "colours": f"{COLOURS} of matplotlib, logarithmic from nearest to farthest",
+        "nearest": near, "farthest": far, "colours": f"{DEPTH_MAP} of matplotlib, logarithmic from nearest to farthest",
         "meaning": f"picture of the depth along the optical axis, one range for all photos; grey: {_NOTHING} {_LIMITS}",
     }  # fmt: skip
     written = _write_maps(export, PICTURES.path, ".png", about, write)
     legend = export.folder / PICTURES.path / "legend.svg"
     with files.atomic_path(legend) as part:
-        part.write_text(_legend(table, near, far, export.reconstruction), encoding="utf-8")
+        part.write_text(_legend(near, far, export.reconstruction), encoding="utf-8")
     return [*written, legend]
 
 
-def _legend(table: np.ndarray, near: float, far: float, r: Reconstruction) -> str:
+def _legend(near: float, far: float, r: Reconstruction) -> str:
+    table = colour_table(DEPTH_MAP)
     stops, ticks = [], []
     for share in np.linspace(0, 1, _STOPS):
         red, green, blue = table[round(255 * share)].tolist()

@@ -146,7 +146,7 @@ def _write(export: Export) -> list[Path]:
     r = export.reconstruction
     T_cam_world, K = r.cameras()
     some = _even_choice(export.cloud, _FOR_UP)
-    up = find_up(T_cam_world, some.points, point_normals(some, r.depth_z, T_cam_world, K))
+    up = find_up(T_cam_world, some.points, point_normals(some, r.depth_z, T_cam_world, K, r.inside()))
     logger.info("%s: up is %s", FILE_NAME, UP_UNKNOWN if up is None else up.source)
     path = export.folder / FILE_NAME
     return [write_glb(export.cloud, T_cam_world, K, r.image_hw, path, lengths=r.lengths, up=up)]

@@ -47,7 +47,7 @@ def find_up(T_cam_world: np.ndarray, points: np.ndarray, normals: np.ndarray) ->
         points: (n, 3) in the world; some thousands will do.
         normals: (n, 3) of the points, 0 where they are not known.
     """
-    of_cameras = _cameras_up(T_cam_world[:, :3, :3].astype(np.float64))
+    of_cameras = cameras_up(T_cam_world[:, :3, :3].astype(np.float64))
     if of_cameras is None:
         return None
     plane = _plane_near(of_cameras, points.astype(np.float64), normals)
@@ -57,7 +57,8 @@ def find_up(T_cam_world: np.ndarray, points: np.ndarray, normals: np.ndarray) ->
     return Up(direction=normal, source=f"the normal of a plane with {100 * share:.0f} % of the points")
 
 
-def _cameras_up(R: np.ndarray) -> np.ndarray | None:
+def cameras_up(R: np.ndarray) -> np.ndarray | None:
+    """Return which way is up (3,) by cameras (S, 3, 3) alone, most of them held level; None where they disagree."""
     right, up = R[:, 0], -R[:, 1]
     limit = np.sin(np.deg2rad(MOST_ROLL_DEG))
     best: np.ndarray = np.zeros(len(R), dtype=bool)

@@ -73,7 +73,7 @@ def _write(export: Export) -> list[Path]:
     from freegeo.fusion.normals import point_normals
 
     r = export.reconstruction
-    normals = point_normals(export.cloud, r.depth_z, *r.cameras())
+    normals = point_normals(export.cloud, r.depth_z, *r.cameras(), r.inside())
     unknown = np.count_nonzero(~normals.any(axis=1))
     if unknown:
         logger.info("%s: %.2g %% of the points have no normal (0 0 0)", FILE_NAME, 100 * unknown / len(normals))

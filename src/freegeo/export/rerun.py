@@ -99,9 +99,8 @@ def check(names: Sequence[str]) -> None:
 
 
 def _write(export: Export) -> list[Path]:
-    r = export.reconstruction
-    keep = r.valid_pixels() if export.masks is None else r.valid_pixels() & export.masks
-    return [write_rerun(r, export.cloud, keep, export.folder / FILE_NAME)]
+    path = export.folder / FILE_NAME
+    return [write_rerun(export.reconstruction, export.cloud, export.depth_pixels(), path)]
 
 
 FORMAT = Format(name="rerun", path=FILE_NAME, about="recording for the viewer rerun", write=_write, check=check)

@@ -66,7 +66,7 @@ def _encodes(name: str) -> bool:
 
 
 def flythrough(
-    reconstruction: Reconstruction, keep: np.ndarray, *, before: Before | None = None
+    reconstruction: Reconstruction, keep: np.ndarray, *, before: Before | None = None, masks: np.ndarray | None = None
 ) -> Iterator[np.ndarray]:
     """Pictures (H, W, 3) uint8 of a flight along the cameras; those of an earlier prediction on the left, if any.
 
@@ -74,6 +74,7 @@ def flythrough(
         reconstruction: with cameras.
         keep: (S, H, W) bool, pixels that are points; at least one.
         before: an earlier prediction; left out when it is the same as the reconstruction.
+        masks: (S, H, W) bool, the user's, where the points of the earlier prediction are chosen here.
     """
     from cv2 import INTER_AREA, resize
 
@@ -83,7 +84,7 @@ def flythrough(
     (height, width), scale = picture_size(reconstruction.image_hw)
     drawn = round(SUPERSAMPLING * height), round(SUPERSAMPLING * width)
     sides = [(reconstruction, keep)]
-    earlier = None if before is None else _earlier(before, reconstruction)
+    earlier = None if before is None else _earlier(before, reconstruction, masks)
     captions = None
     if before is not None and earlier is not None:
         sides = [earlier, *sides]
@@ -109,7 +110,9 @@ def picture_size(image_hw: tuple[int, int]) -> tuple[tuple[int, int], float]:
     return (height, width), scale
 
 
-def _earlier(before: Before, reconstruction: Reconstruction) -> tuple[Reconstruction, np.ndarray] | None:
+def _earlier(
+    before: Before, reconstruction: Reconstruction, masks: np.ndarray | None
+) -> tuple[Reconstruction, np.ndarray] | None:
     """Return an earlier prediction in the world of a reconstruction, and its points; None where they are the same."""
     from freegeo.export.alignment import align, moved_cameras
     from freegeo.export.formats import filter_reconstruction
@@ -120,7 +123,8 @@ def _earlier(before: Before, reconstruction: Reconstruction) -> tuple[Reconstruc
         raise FreeGeoError(f"{before.folder}: has other views or another size than the result. Run again.")
     if all(np.array_equal(getattr(found, name), getattr(reconstruction, name)) for name in ("T_cam_world", "depth_z")):
         return None
-    keep, _ = load_kept(before.folder, found.depth_z.shape) or filter_reconstruction(found)
+    stored = load_kept(before.folder, found.depth_z.shape) if before.filters is None else None
+    keep, _ = stored or filter_reconstruction(found, masks=masks, settings=before.filters)
     move = align(found, reconstruction)
     cameras = moved_cameras(found.cameras()[0], move)
     return replace(found, depth_z=found.depth_z * np.float32(move.s), T_cam_world=cameras), keep
@@ -145,7 +149,7 @@ def _caption(text: str, height: int, width: int) -> tuple[np.ndarray, np.ndarray
 
 def _write(export: Export) -> list[Path]:
     export.require_pixels()
-    pictures = flythrough(export.reconstruction, export.keep, before=export.before)
+    pictures = flythrough(export.reconstruction, export.keep, before=export.before, masks=export.masks)
     return [write_video(pictures, export.folder / FILE_NAME)]
 
 

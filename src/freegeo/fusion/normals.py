@@ -12,7 +12,9 @@ _REACH = 2
 """Pixels on each side that `on_one_surface` looks at."""
 
 
-def point_normals(cloud: PointCloud, depth_z: np.ndarray, T_cam_world: np.ndarray, K: np.ndarray) -> np.ndarray:
+def point_normals(
+    cloud: PointCloud, depth_z: np.ndarray, T_cam_world: np.ndarray, K: np.ndarray, inside: np.ndarray
+) -> np.ndarray:
     """Unit normals (n, 3) float32 of a cloud's points in the world, towards the camera; 0 where they are not known.
 
     The cross product of the steps to the neighbours along the row and along the column. A step counts if both pixels
@@ -24,13 +26,16 @@ def point_normals(cloud: PointCloud, depth_z: np.ndarray, T_cam_world: np.ndarra
         depth_z: (S, H, W); what is not finite and positive is no neighbour.
         T_cam_world: (S, 4, 4).
         K: (S, 3, 3).
+        inside: (S, H, W) bool; pixels in the padding around a photo are no neighbours either.
     """
     normals = np.zeros((len(cloud), 3), np.float32)
     ends = np.searchsorted(cloud.view, np.arange(len(depth_z)), side="right").tolist()
     start = 0
     for view, end in enumerate(ends):
         if end > start:
-            in_camera = _pixel_normals(depth_z[view], K[view].astype(np.float64), cloud.pixel[start:end])
+            in_camera = _pixel_normals(
+                np.where(inside[view], depth_z[view], np.nan), K[view].astype(np.float64), cloud.pixel[start:end]
+            )
             normals[start:end] = in_camera @ T_cam_world[view, :3, :3]
         start = end
     return normals

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import importlib
 import logging
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.models.spec import LoadedFrom, ModelEntry
@@ -27,6 +28,7 @@ EMBEDDED_MODEL = "freegeo-tiny"
 _SHOWN = 200
 """Most characters of the error of a plug-in that a message shows."""
 PLUGIN_GROUP = "freegeo.models"
+T = TypeVar("T")
 
 
 def names() -> list[str]:
@@ -66,6 +68,20 @@ def broken(name: str, error: Exception) -> Exception:
     return FreeGeoError(
         f"the plug-in '{name}' ({point.value}) does not work ({reason}). Reinstall it, or tell its author."
     )
+
+
+def for_each(make: Callable[[str], T]) -> list[T]:
+    """Return what a function makes of the name of every model; a plug-in that does not work is a warning."""
+    found = []
+    for name in names():
+        try:
+            found.append(make(name))
+        except Exception as error:
+            told = broken(name, error)
+            if not isinstance(told, FreeGeoError):
+                raise
+            logger.warning("%s", told)
+    return found
 
 
 def warn_of_embedded_model() -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from freegeo.export.colours import coloured
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.report.result import Result, Stage, even_choice
 from freegeo.report.scene3d import level_rotation
@@ -20,12 +21,11 @@ MAX_WIDTH = 320
 """Widest embedded picture; with many views they become narrower, so that the page stays small."""
 SMALL_WIDTH = 160
 """Up to this width pictures are stored without loss."""
-INVALID_GREY = 128
 MOST_STROKES = 100
 """Cameras whose viewing directions are drawn."""
 MOST_NUMBERED = 16
 """Chunks or cameras whose numbers are written into a drawing."""
-DEPTH_MAP, CONF_MAP, ERROR_MAP, CHANGE_MAP = "viridis_r", "cividis", "inferno", "RdBu_r"
+CONF_MAP, ERROR_MAP, CHANGE_MAP = "cividis", "inferno", "RdBu_r"
 # Placeholders that the page's colours replace, so that one figure works in light and dark mode.
 _INK, _FAINT = "#010203", "#040506"
 _STAGE_INK = {"frozen": "#070809", "adapted": "#0a0b0c", "refined": "#101112", "truth": "#0d0e0f"}
@@ -42,34 +42,9 @@ _PAGE_COLOURS = {
 }
 
 
-def log_range(maps: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Common range of positive maps, from the 2nd to the 98th percentile; (1, 2) without valid values."""
-    values = np.concatenate([m[np.isfinite(m) & (m > 0)].ravel() for m in maps])
-    if values.size == 0:
-        return 1.0, 2.0
-    low, high = (float(v) for v in np.quantile(values, (0.02, 0.98)))
-    return (low, high) if high > low * 1.0001 else (low / 1.05, high * 1.05)
-
-
-def log_colours(values: np.ndarray, limits: tuple[float, float], name: str) -> np.ndarray:
-    """Colours (..., 3) uint8 of positive values on a logarithmic scale; what is not positive or finite is grey."""
-    usable = np.isfinite(values) & (values > 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.log(values / limits[0]) / np.log(limits[1] / limits[0])
-    return _coloured(share, usable, name)
-
-
 def linear_colours(values: np.ndarray, limits: tuple[float, float], name: str) -> np.ndarray:
     """Colours (..., 3) uint8 of values on a linear scale; what is not finite is grey."""
-    return _coloured((values - limits[0]) / (limits[1] - limits[0]), np.isfinite(values), name)
-
-
-def _coloured(share: np.ndarray, usable: np.ndarray, name: str) -> np.ndarray:
-    from matplotlib import colormaps
-
-    table = (colormaps[name](np.linspace(0, 1, 256))[:, :3] * 255).round().astype(np.uint8)
-    index = np.clip(np.where(usable, share, 0) * 255, 0, 255).astype(np.uint8)
-    return np.where(usable[..., None], table[index], np.uint8(INVALID_GREY))
+    return coloured((values - limits[0]) / (limits[1] - limits[0]), np.isfinite(values), name)
 
 
 def gradient(name: str) -> str:

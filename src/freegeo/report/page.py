@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from freegeo import files
+from freegeo.export.colours import DEPTH_MAP, log_colours, log_range
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.report import figures, sequence
 from freegeo.report.answer import HEADER, NOTE, answer, rescaled
@@ -185,7 +186,7 @@ def views(result: Result, photos: Sequence[PhotoLike] | None = None) -> Iterator
 def _maps(result: Result, view: int, depth_range: Range, conf_range: Range) -> Iterator[tuple[str, str, np.ndarray]]:
     """The colour-coded maps of a view: CSS classes, caption, image."""
     for stage in result.stages.values():
-        depth = figures.log_colours(result.view_depth(stage, view), depth_range, figures.DEPTH_MAP)
+        depth = log_colours(result.view_depth(stage, view), depth_range, DEPTH_MAP)
         yield f"depth {stage.key}", f"depth, {stage.label}", depth
     if len(result.predictions) > 1:
         before, after = (result.view_depth(result.predictions[k], view) for k in (0, -1))
@@ -196,14 +197,14 @@ def _maps(result: Result, view: int, depth_range: Range, conf_range: Range) -> I
             colours = figures.linear_colours(error, (0, ERROR_LIMIT), figures.ERROR_MAP)
             yield f"error {stage.key}", f"depth error, {stage.label}", colours
     for stage in result.predictions:
-        conf = figures.log_colours(result.full[stage.key].conf[view], conf_range, figures.CONF_MAP)
+        conf = log_colours(result.full[stage.key].conf[view], conf_range, figures.CONF_MAP)
         yield f"confidence {stage.key}", f"confidence, {stage.label}", conf
 
 
 def map_ranges(result: Result) -> tuple[Range, Range]:
     """Ranges of depth and confidence that all views and stages share."""
-    depth = figures.log_range([stage.depth_z for stage in result.stages.values()])
-    return depth, figures.log_range([stage.conf for stage in result.predictions])
+    depth = log_range(lambda: (stage.depth_z for stage in result.stages.values()))
+    return depth, log_range(lambda: (stage.conf for stage in result.predictions))
 
 
 def change_map(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -216,7 +217,7 @@ def change_map(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 def legends(result: Result) -> list[dict[str, str]]:
     """Colour scales: name, ends and gradient."""
     depth_range, conf_range = map_ranges(result)
-    found = [_legend("depth", f"{depth_range[0]:.3g}", f"{depth_range[1]:.3g}", figures.DEPTH_MAP)]
+    found = [_legend("depth", f"{depth_range[0]:.3g}", f"{depth_range[1]:.3g}", DEPTH_MAP)]
     found.append(_legend("confidence", f"{conf_range[0]:.3g}", f"{conf_range[1]:.3g}", figures.CONF_MAP))
     if len(result.predictions) > 1:
         limit = _percent(CHANGE_LIMIT, 0)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from freegeo.export.glb import frustum_corners
+from freegeo.export.gravity import cameras_up
 from freegeo.report.result import MANY_VIEWS, Result, Stage, even_choice
 
 MAX_KEPT, MAX_REMOVED = 36_000, 9_000
@@ -33,10 +34,12 @@ FILLED = 0.93
 def level_rotation(T_cam_world: np.ndarray) -> np.ndarray:
     """Rotation (3, 3) from the world to x right, y up, z towards the viewer, for cameras (S, 4, 4).
 
-    Up is the mean up of the cameras; forward is their mean viewing direction, made level.
+    Up is that of cameras that are held level (`freegeo.export.gravity`), otherwise the mean of the cameras' own;
+    forward is their mean viewing direction, made level.
     """
     R = T_cam_world[:, :3, :3].astype(np.float64)
-    up = _unit(-R[:, 1].mean(0), -R[0, 1])
+    found = cameras_up(R)
+    up = _unit(-R[:, 1].mean(0), -R[0, 1]) if found is None else found
     forward = R[:, 2].mean(0)
     # Cameras that look all round or straight down have no level mean direction; then the first camera's x axis is used.
     right = _unit(np.cross(forward, up), np.cross(np.cross(up, R[0, 0]), up), least=0.05)

@@ -19,13 +19,14 @@ import numpy as np
 import torch
 
 from freegeo.errors import UserError
+from freegeo.export.colours import DEPTH_MAP, log_colours, log_range
 from freegeo.export.mesh import FILE_NAME as MESH_NAME
 from freegeo.export.mesh import load_mesh
 from freegeo.geometry.rotation import matrix_to_quat_xyzw, quat_xyzw_to_wxyz
 from freegeo.geometry.sim3 import Sim3
 from freegeo.report import sequence
 from freegeo.report.answer import answer
-from freegeo.report.figures import CONF_MAP, DEPTH_MAP, ERROR_MAP, linear_colours, log_colours, log_range
+from freegeo.report.figures import CONF_MAP, ERROR_MAP, linear_colours
 from freegeo.report.origin import own_pages_only, require_free_port
 from freegeo.report.result import Result, Stage, even_choice, load_result, moved, moved_by
 from freegeo.report.scene3d import (
@@ -84,8 +85,8 @@ class Viewer:
         self.meshes: dict[str, Any] = {}
         self._place(results[0])
         ranges = {
-            "depth": log_range([layer.stage.depth_z for layer in self.layers]),
-            "confidence": log_range([layer.stage.conf for layer in self.layers]),
+            "depth": log_range(lambda: (layer.stage.depth_z for layer in self.layers)),
+            "confidence": log_range(lambda: (layer.stage.conf for layer in self.layers)),
         }
         for layer in self.layers:
             self._add(layer, ranges)

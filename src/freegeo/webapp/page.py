@@ -3,7 +3,6 @@
 # Annotations are values here, not text: Gradio looks for `gr.Request` among those of functions inside a function.
 import base64
 import io
-import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -12,37 +11,28 @@ from freegeo.adaptation.recipe import Guard, RecipeName
 from freegeo.data.image_files import UnreadableImageError
 from freegeo.data.photos import evenly_spaced, open_photos
 from freegeo.data.video import is_video
-from freegeo.errors import FreeGeoError, UserError
-from freegeo.export.base import DEFAULT_FORMATS, KEPT_NAME, TRACKS_NAME
+from freegeo.errors import UserError
+from freegeo.export.base import DEFAULT_FORMATS
 from freegeo.export.formats import FORMATS
 from freegeo.models import catalog
 from freegeo.models.spec import ModelEntry
 from freegeo.report.answer import answer
+from freegeo.report.contents import contents
 from freegeo.report.result import REPORT_NAME, SUMMARY_NAME
 from freegeo.report.schema import Summary, read_part
-from freegeo.webapp.runs import PHOTOS, Choice, Run
+from freegeo.webapp.runs import PHOTOS, ZIP_NAME, Choice, Run
 from freegeo.webapp.sessions import AWAY_S, Session, Sessions
 
 if TYPE_CHECKING:
     import gradio as gr
 
-logger = logging.getLogger(__name__)
-
 HERE = Path(__file__).parent / "templates"
 TICK_S = 0.7
 MOST_VIEWS = 32
 """Default limit of the photos that are used, as many as one browser page shows well."""
-MATCHES_NAME = "matches.npz"
+MOST_DIGITS = 9
+"""Of a number in the page."""
 THUMBNAILS, THUMBNAIL_SIDE = 8, 128
-ZIP_NAME = "freegeo.zip"
-ABOUT_FILES = {
-    REPORT_NAME: "everything on one page, to keep and to send",
-    SUMMARY_NAME: "settings, timings, versions, licence of the weights",
-    KEPT_NAME: "which pixels the filters kept as points",
-    TRACKS_NAME: "measured points of the refinement",
-    MATCHES_NAME: "matches between the photos, which the verdict rests on",
-    **{format.path: format.about for format in FORMATS.values()},
-}
 SHOW_PANEL = "() => document.querySelector('#outcome').scrollIntoView({behavior: 'smooth', block: 'nearest'})"
 """On a phone the panel is below the controls."""
 NAME_RUN = """() => {
@@ -60,16 +50,7 @@ RECIPES: tuple[RecipeName, ...] = ("scene", "evidence")
 
 def models() -> list[ModelEntry]:
     """Return the models that can be used; plug-ins that do not work are left out with a warning."""
-    found = []
-    for name in catalog.names():
-        try:
-            found.append(catalog.entry(name))
-        except Exception as error:
-            told = catalog.broken(name, error)
-            if not isinstance(told, FreeGeoError):
-                raise
-            logger.warning("%s", told)
-    return found
+    return catalog.for_each(catalog.entry)
 
 
 def download_of(item: ModelEntry) -> str:
@@ -175,8 +156,7 @@ def files(run: Run) -> Iterator[dict[str, str]]:
     there = [path for path in run.result.iterdir() if path.is_file() and not path.name.startswith(".")]
     rank = {name: number for number, name in enumerate(order)}
     for path in sorted(there, key=lambda path: (rank.get(path.name, len(rank)), path.name)):
-        about = ABOUT_FILES.get(path.name, "")
-        yield {"name": path.name, "size": _size(path.stat().st_size), "about": about}
+        yield {"name": path.name, "size": _size(path.stat().st_size), "about": contents().get(path.name, "")}
 
 
 def _size(count: float) -> str:
@@ -329,11 +309,12 @@ def build(sessions: Sessions, *, model: str) -> "gr.Blocks":
 
 def whole_number(text: str, label: str) -> int | None:
     """Read a number of at least 1; None for an empty field. UserError for anything else."""
-    if not text.strip():
+    digits = text.strip()
+    if not digits:
         return None
-    if not text.strip().isdecimal() or int(text) < 1:
-        raise UserError(f"{label} is a whole number from 1 on, got '{text}'.")
-    return int(text)
+    if not digits.isdecimal() or len(digits) > MOST_DIGITS or int(digits) < 1:
+        raise UserError(f"{label} is a whole number from 1 on, got '{text[:40]}'.")
+    return int(digits)
 
 
 def _key(request: "gr.Request") -> str:

@@ -30,6 +30,8 @@ logger = logging.getLogger(__name__)
 
 PHOTOS, RESULT, SCRATCH = "photos", "result", "scratch"
 """Folders of a run."""
+ZIP_NAME = "freegeo.zip"
+"""The zip file of a result, in the folder of its run."""
 DONE_CODES = {0, 3}
 """Exit codes of a run whose result is there; 3 with something missing, which the result says."""
 GRACE_S = 20.0

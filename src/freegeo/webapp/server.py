@@ -18,7 +18,7 @@ from freegeo.lock import LOCK_FILE
 from freegeo.models import catalog
 from freegeo.report.origin import is_own_host, is_own_page, require_free_port
 from freegeo.report.result import REPORT_NAME
-from freegeo.webapp.runs import Run
+from freegeo.webapp.runs import ZIP_NAME, Run
 from freegeo.webapp.sessions import Sessions
 
 if TYPE_CHECKING:
@@ -122,20 +122,31 @@ def _add_results(app: FastAPI, sessions: Sessions) -> None:
             raise HTTPException(404, "there is no such part.")
         return HTMLResponse(one_part((run.result / REPORT_NAME).read_text("utf-8"), part))
 
-    @app.get("/result/{token}/files/{name}")
+    @app.get("/result/{token}/files/{name:path}")
     def fetch_file(token: str, name: str) -> FileResponse:
-        path = finished(token).result / name
-        if name.startswith(".") or path.is_symlink() or not path.is_file():
-            raise HTTPException(404, "there is no such file.")
+        path = result_file(finished(token), name)
+        if path is None:
+            raise HTTPException(404, "there is no such file; folders are in the zip file of the result.")
         inline = name == REPORT_NAME
-        return FileResponse(path, filename=name, content_disposition_type="inline" if inline else "attachment")
+        return FileResponse(path, filename=path.name, content_disposition_type="inline" if inline else "attachment")
 
-    @app.get("/result/{token}/freegeo.zip")
+    @app.get(f"/result/{{token}}/{ZIP_NAME}")
     def fetch_all(token: str) -> FileResponse:
         run = finished(token)
         with zipping:
             path = zipped(run)
-        return FileResponse(path, filename="freegeo.zip")
+        return FileResponse(path, filename=ZIP_NAME)
+
+
+def result_file(run: Run, name: str) -> Path | None:
+    """Return a file of a result by its path there, as the report links to it; None for hidden files and links."""
+    path = run.result / name
+    hidden = any(part.startswith(".") for part in Path(name).parts)
+    try:
+        within = path.resolve().is_relative_to(run.result.resolve())
+        return path if within and not hidden and not path.is_symlink() and path.is_file() else None
+    except (OSError, ValueError):  # a name that no file can have
+        return None
 
 
 def one_part(report: str, part: str) -> str:
@@ -147,7 +158,7 @@ def one_part(report: str, part: str) -> str:
 
 def zipped(run: Run) -> Path:
     """Return the zip file of a result, which is made at the first call."""
-    path = run.folder / "freegeo.zip"
+    path = run.folder / ZIP_NAME
     if not path.is_file():
         part = path.with_suffix(".part")
         with zipfile.ZipFile(part, "w") as archive:

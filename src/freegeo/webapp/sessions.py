@@ -18,7 +18,7 @@ from freegeo.data.photos import natural_key
 from freegeo.data.video import is_video
 from freegeo.errors import UserError
 from freegeo.lock import locked
-from freegeo.webapp.runs import GRACE_S, PHOTOS, RESULT, Choice, Queue, Run, command
+from freegeo.webapp.runs import GRACE_S, PHOTOS, RESULT, ZIP_NAME, Choice, Queue, Run, command
 
 logger = logging.getLogger(__name__)
 
@@ -108,7 +108,7 @@ class Sessions:
     def start(self, session: Session, choice: Choice) -> Run:
         """Queue a run of a page's uploads; with the same inputs as before it continues where that ended.
 
-        UserError when there is nothing to reconstruct, or when the page's run has not ended.
+        UserError when there is nothing to reconstruct, when the page's run has not ended, or when the disk is full.
         """
         with self._guard:
             before = session.run
@@ -118,10 +118,12 @@ class Sessions:
             inputs = (tuple(sources), choice)
             if before is not None and before.inputs == inputs and before.folder.is_dir():
                 folder = before.folder
+                # The result may become another one: what was missing may be there now.
+                (folder / ZIP_NAME).unlink(missing_ok=True)
             else:
                 self._remove(before)
-                folder = self._new_folder()
-                _take(sources, folder / PHOTOS)
+                session.run = None
+                folder = self._new_folder(sources)
             names = list((folder / PHOTOS).iterdir())
             source = names[0] if len(names) == 1 and is_video(names[0]) else folder / PHOTOS
             session.run = Run(
@@ -159,10 +161,20 @@ class Sessions:
         while not self._ended.wait(SWEEP_S):
             self.sweep(time.monotonic())
 
-    def _new_folder(self) -> Path:
-        if self.keep is None:
-            return Path(tempfile.mkdtemp(prefix="run-", dir=self.folder))
-        return Path(tempfile.mkdtemp(prefix=f"{datetime.now():%Y-%m-%d-%H%M%S}-", dir=self.keep))
+    def _new_folder(self, sources: Sequence[Path]) -> Path:
+        """Make the folder of a run, with its photos."""
+        prefix = "run-" if self.keep is None else f"{datetime.now():%Y-%m-%d-%H%M%S}-"
+        folder = None
+        try:
+            folder = Path(tempfile.mkdtemp(prefix=prefix, dir=self.keep or self.folder))
+            _take(sources, folder / PHOTOS)
+        except OSError as error:
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+            raise UserError(
+                f"the photos cannot be stored on the machine that runs this page ({error.strerror})."
+            ) from None
+        return folder
 
     def _remove(self, run: Run | None) -> None:
         """End a run and remove its folder, unless results are kept."""
