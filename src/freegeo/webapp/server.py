@@ -122,20 +122,24 @@ def _add_results(app: FastAPI, sessions: Sessions) -> None:
             raise HTTPException(404, "there is no such part.")
         return HTMLResponse(one_part((run.result / REPORT_NAME).read_text("utf-8"), part))
 
-    @app.get("/result/{token}/files/{name}")
+    @app.get("/result/{token}/files/{name:path}")
     def fetch_file(token: str, name: str) -> FileResponse:
-        path = finished(token).result / name
-        if name.startswith(".") or path.is_symlink() or not path.is_file():
+        run = finished(token)
+        path = part_of(run.result, name)
+        if path is None:
             raise HTTPException(404, "there is no such file.")
-        inline = name == REPORT_NAME
-        return FileResponse(path, filename=name, content_disposition_type="inline" if inline else "attachment")
+        if path.is_dir():
+            with zipping:
+                path = zipped(run, path)
+        inline = path.name == REPORT_NAME
+        return FileResponse(path, filename=path.name, content_disposition_type="inline" if inline else "attachment")
 
     @app.get("/result/{token}/freegeo.zip")
     def fetch_all(token: str) -> FileResponse:
         run = finished(token)
         with zipping:
-            path = zipped(run)
-        return FileResponse(path, filename="freegeo.zip")
+            path = zipped(run, run.result)
+        return FileResponse(path, filename=path.name)
 
 
 def one_part(report: str, part: str) -> str:
@@ -145,13 +149,22 @@ def one_part(report: str, part: str) -> str:
     return report.replace("</head>", f"{render('part.html.j2', part=part)}</head>", 1)
 
 
-def zipped(run: Run) -> Path:
-    """Return the zip file of a result, which is made at the first call."""
-    path = run.folder / "freegeo.zip"
+def part_of(result: Path, name: str) -> Path | None:
+    """Return a file or folder of a result; None where the name is of none, is hidden, or leads out of the result."""
+    parts = Path(name).parts
+    if not parts or Path(name).is_absolute() or "\0" in name or any(part.startswith(".") for part in parts):
+        return None
+    path = result / name
+    return path if path.exists() and path.resolve() == result.resolve() / name else None
+
+
+def zipped(run: Run, folder: Path) -> Path:
+    """Return the zip file of a result, or of a folder in it, which is made at the first call."""
+    path = run.folder / ("-".join(["freegeo", *folder.relative_to(run.result).parts]) + ".zip")
     if not path.is_file():
         part = path.with_suffix(".part")
         with zipfile.ZipFile(part, "w") as archive:
-            for file in sorted(run.result.rglob("*")):
+            for file in sorted(folder.rglob("*")):
                 if file.is_file() and not file.is_symlink() and file.name != LOCK_FILE:
                     archive.write(file, Path("freegeo", file.relative_to(run.result)))
         part.replace(path)
