@@ -128,6 +128,12 @@ def test_photos_become_a_result(open_page, app, photos):
     with zipfile.ZipFile(io.BytesIO(Path(fetched.value.path()).read_bytes())) as archive:
         assert {"freegeo/points.ply", "freegeo/scene.glb", "freegeo/report.html"} <= set(archive.namelist())
 
+    report = page.get_attribute("text=Open the whole report", "href")
+    links = re.findall(r'<li><a href="([^"]+)">', app.get(f"/{report}")[1].decode())
+    assert {"frozen/prediction.npz", "adapter/", "points.ply"} <= set(links)
+    for link in links:
+        assert app.get(f"/{report.removesuffix('report.html')}{link}")[0] == 200, link
+
     for width in (390, 320):
         page.set_viewport_size({"width": width, "height": 844})
         page.wait_for_timeout(300)
@@ -201,8 +207,8 @@ def test_two_pages_take_turns_and_see_nothing_of_each_other(open_page, app, phot
             assert app.get(f"/{result}/{path}")[0] == 404, path
     assert app.get("/result/other/files/report.html")[0] == 404
     third = open_page(app.address)
-    third.wait_for_selector("#start")
-    assert third.inner_text("#panel").startswith("How to begin")
+    third.wait_for_selector(".fg-begin")
+    assert third.locator(".fg-result, .fg-running").count() == 0
 
 
 def test_only_the_apps_own_page_is_answered(app):

@@ -191,7 +191,7 @@ def test_export_is_partial_too_and_fails_when_nothing_is_written(freegeo, out, t
     outcome = freegeo("export", out, "-f", "ply", "depth", "--min-agreeing", 50, "-o", other)
     assert outcome.code == 3
     assert "ply not written" in outcome.sentence()
-    assert str(other / "depth" / "0.png") in outcome.out
+    assert str(other / "depth") in outcome.out
     assert not (other / "points.ply").exists(), "the points of other filters are gone"
     outcome = freegeo("export", out, "-f", "ply", "--min-agreeing", 50, "-o", other)
     assert outcome.code == 1
@@ -296,6 +296,8 @@ def test_depth_keeps_the_size_that_a_folder_was_made_with_until_another_is_asked
     assert freegeo(*again, "--formats", "kitti").code == 0
     assert shapes(tmp_path / "out") == {(96, 128)}
     assert (tmp_path / "out" / "trajectory-kitti.txt").is_file()
+    assert freegeo("export", tmp_path / "out", "-f", "depth-npy").code == 0
+    assert shapes(tmp_path / "out") == {(96, 128)}
     outcome = freegeo(*again, "--depth-size", "model", "--formats", "depth-npy")
     assert outcome.code == 0 and "already finished" not in outcome.out
     assert shapes(tmp_path / "out") == {(48, 64)}
@@ -313,6 +315,9 @@ def test_a_later_export_interpolates_depth_by_the_photos_and_refuses_without_the
     assert outcome.code == 0
     assert "interpolated from the model's along the edges" in outcome.err
     assert shapes(out) == {(96, 128)}
+    assert outcome.out.splitlines()[0].split()[0] == str(out / "depth-npy"), (
+        "folders are listed, not all of their files"
+    )
     shutil.rmtree(photos)
     outcome = freegeo(*asked, "-o", tmp_path / "new")
     assert outcome.code == 2

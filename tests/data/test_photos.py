@@ -14,6 +14,7 @@ from freegeo.data import image_files
 from freegeo.data.image_files import MAX_PIXELS
 from freegeo.data.photos import MemoryPhoto, evenly_spaced, load_photos, natural_key, unique_names
 from freegeo.errors import UserError
+from freegeo.files import RUN_FILE
 from png_header import png_header
 
 ORIENTATION = 0x0112
@@ -445,6 +446,18 @@ def test_where_the_photos_are_instead(tmp_path):
         assert "`freegeo adapt` takes several" in refusal(source)
         assert "notes" not in refusal(source)
     assert f"in 2 folders: {tmp_path}/deep/er (1), {tmp_path}/left (2)" in refusal(tmp_path)
+
+
+def test_photos_in_sub_folders_of_a_folder_of_photos_are_named(tmp_path, caplog):
+    for name in ("a.png", "day one/1.jpg", "day one/2.HEIC", "deep/er/3.png", ".thumbs/4.jpg", "out/images/5.png"):
+        save(tmp_path / name, format="PNG")
+    (tmp_path / "out" / RUN_FILE).touch()
+    assert names(tmp_path) == ["a.png"]
+    found = f"2 hold images: {tmp_path}/day one (2), {tmp_path}/deep/er (1)."
+    assert f"{tmp_path}: sub-folders are not searched, and {found}" in caplog.text
+    caplog.clear()
+    assert names(f"{tmp_path}/*") == ["a.png"]
+    assert caplog.text == "", "a pattern says what it is about"
 
 
 def test_videos_in_place_of_photos(tmp_path):

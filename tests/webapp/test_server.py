@@ -70,26 +70,29 @@ def finished(tmp_path):
 
 
 def test_the_zip_file_holds_the_result_and_nothing_else(finished):
-    path = server.zipped(finished)
+    path = server.zipped(finished, finished.result)
     with zipfile.ZipFile(path) as archive:
         names = set(archive.namelist())
         assert archive.testzip() is None
     assert {"freegeo/report.html", "freegeo/prediction.npz", "freegeo/frozen/prediction.npz"} <= names
     assert not [name for name in names if LOCK_FILE in name or "link" in name]
     written = path.stat().st_mtime_ns
-    assert server.zipped(finished).stat().st_mtime_ns == written
+    assert server.zipped(finished, finished.result).stat().st_mtime_ns == written
 
 
-def test_all_files_that_the_report_links_to_are_served_and_nothing_else(finished, tmp_path):
-    result = tmp_path / RESULT
-    (tmp_path / "secret.txt").touch()
-    (result / "outside").symlink_to(tmp_path)
-    for name in ("report.html", "frozen/prediction.npz"):
-        assert server.result_file(finished, name) == result / name
-    hidden = (".freegeo-run.json", LOCK_FILE, "frozen/../.freegeo-run.json", "link", "outside/secret.txt")
-    beyond = ("../secret.txt", "frozen/../../secret.txt", str(tmp_path / "secret.txt"))
-    for name in (*hidden, *beyond, "frozen/", "", "no", "x" * 5000, "\0"):
-        assert server.result_file(finished, name) is None, name
+def test_the_files_that_the_report_links_to_are_there_and_no_others(finished):
+    result = finished.result
+    for name in ("prediction.npz", "frozen/prediction.npz", "frozen/", "frozen"):
+        assert server.part_of(result, name) == result / name
+    for name in ("", ".", "..", "../photos", "frozen/../../photos", str(result), "/etc/passwd", "link", "link/x", "no",
+                 ".freegeo-run.json", LOCK_FILE, "frozen/\0", "x" * 5000):  # fmt: skip
+        assert server.part_of(result, name) is None, name
+    (result / "elsewhere").symlink_to(finished.folder / PHOTOS)
+    assert server.part_of(result, "elsewhere/0.jpg") is None
+    path = server.zipped(finished, result / "frozen")
+    assert path.name == "freegeo-frozen.zip"
+    with zipfile.ZipFile(path) as archive:
+        assert archive.namelist() == ["freegeo/frozen/prediction.npz"]
 
 
 def test_every_file_of_a_result_is_explained_as_in_the_report(finished):

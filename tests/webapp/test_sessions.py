@@ -92,7 +92,7 @@ def test_a_zip_file_is_not_that_of_the_run_before(sessions):
     first = sessions.start(page, TINY)
     (first.folder / RESULT).mkdir()
     (first.folder / RESULT / "a.txt").touch()
-    old = zipped(first)
+    old = zipped(first, first.result)
     sessions.queue.cancel(first)
     sessions.queue.wait_for(first, 20)
     again = sessions.start(page, TINY)

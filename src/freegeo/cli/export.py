@@ -31,7 +31,7 @@ def export(
     max_points: int = MAX_POINTS,
     max_tracks: int = MAX_TRACKS,
     voxel: float | None = None,
-    depth_size: DepthSize = "model",
+    depth_size: DepthSize | None = None,
     filters: FilterOptions | None = None,
 ) -> None:
     """Write a reconstruction in other formats.
@@ -53,6 +53,7 @@ def export(
         Voxel edge of the mesh, in the reconstruction's units; default: from its resolution.
     depth_size
         Size of depth files: model, that of the model's images, or photo, interpolated from it along the photos' edges.
+        Default: as the command that made the result wrote them.
     """
     from freegeo.export import formats
     from freegeo.export.kept import load_kept, load_masks
@@ -86,6 +87,8 @@ def export(
                 if target.resolve() == run:
                     require_points_of_report(target, filtered[0])
         summary = stored_summary(run or home)
+        if depth_size is None:
+            depth_size = "photo" if summary["settings"].get("depth_size") == "photo" else "model"
         before = None
         if home.resolve() == run and summary.get("adapter"):
             before = before_adaptation(home, summary.get("refinement"))
@@ -100,8 +103,8 @@ def export(
                 voxel=voxel, tracks=load_tracks(home, len(reconstruction)), before=before,
                 depth_size=depth_size,
             ).require_any()  # fmt: skip
-    for file in result.files:
-        console.say(f"  {file}  {console.size(file)}")
+    for path in dict.fromkeys(target / file.relative_to(target).parts[0] for file in result.files):
+        console.say(f"  {path}  {console.size(path)}")
     require_complete(target, result.failed)
 
 
@@ -129,13 +132,13 @@ def result_folder(folder: Path) -> Path | None:
 def stored_summary(folder: Path) -> dict[str, Any]:
     """Return what later commands read of reconstruction.json in a folder; DamagedError when it is damaged.
 
-    `images`, `photo_files`, `refinement` and `warnings` are empty where the file, or the field, is missing.
+    `images`, `photo_files`, `refinement`, `settings` and `warnings` are empty where the file, or the field, is missing.
     """
     from freegeo.job import SUMMARY_NAME
     from freegeo.report.schema import Summary, read_part
 
     summary = read_part(folder / SUMMARY_NAME, Summary)
-    empty = {"images": [], "photo_files": [], "refinement": {}, "warnings": []}
+    empty = {"images": [], "photo_files": [], "refinement": {}, "settings": {}, "warnings": []}
     return summary | {name: summary.get(name) or nothing for name, nothing in empty.items()}
 
 

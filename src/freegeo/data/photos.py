@@ -34,6 +34,7 @@ from freegeo.data.image_files import (
 )
 from freegeo.data.video import is_video, load_video
 from freegeo.errors import UserError
+from freegeo.files import RUN_FILE
 
 if TYPE_CHECKING:
     from PIL.Image import Image as PillowImage
@@ -208,7 +209,14 @@ def _found_files(source: str | Path) -> list[Path]:
         raise UserError("the name of the photos is empty. Give a folder of photos, a glob or a photo.")
     path = Path(source).expanduser()
     if path.is_dir():
-        return _photos_among(str(path), _by_name(path.iterdir())) or _no_photos(str(path), _sub_folders(path))
+        photos, folders = _photos_among(str(path), _by_name(path.iterdir())), _sub_folders(path)
+        if full := _with_photos(folders) if photos else []:
+            logger.warning(
+                "%s: sub-folders are not searched, and %d hold images: %s. If these are photos of this scene, give all "
+                "photos as a list of files or with a pattern such as %s.",
+                path, len(full), some_of(full), shlex.quote(f"{path}/**/*.jpg"),
+            )  # fmt: skip
+        return photos or _no_photos(str(path), folders)
     if path.is_file():
         return [path]
     if glob.has_magic(str(source)):
@@ -260,8 +268,7 @@ def _is_hidden(path: Path) -> bool:
 
 def _no_photos(where: str, folders: Sequence[Path]) -> list[Path]:
     """Say what there is instead of photos."""
-    counts = {folder: sum(_named_image(path) for path in folder.iterdir()) for folder in folders}
-    full = [f"{folder} ({count})" for folder, count in counts.items() if count]
+    full = _with_photos(folders)
     if not full:
         raise UserError(f"{where}: no photos found. Supported are {KINDS}.")
     raise UserError(
@@ -270,14 +277,21 @@ def _no_photos(where: str, folders: Sequence[Path]) -> list[Path]:
     )
 
 
+def _with_photos(folders: Sequence[Path]) -> list[str]:
+    """Return the folders that hold images by their names, each with the number of these."""
+    counts = {folder: sum(_named_image(path) for path in folder.iterdir()) for folder in folders}
+    return [f"{folder} ({count})" for folder, count in counts.items() if count]
+
+
 def _named_image(path: Path) -> bool:
     return path.suffix.lower() in IMAGE_SUFFIXES and path.is_file() and not _is_hidden(path)
 
 
 def _sub_folders(folder: Path) -> list[Path]:
-    """Return the folders one and two levels below a folder."""
-    below = [*folder.glob("*"), *folder.glob("*/*")]
-    return _by_name(path for path in below if path.is_dir() and not _is_hidden(path))
+    """Return the folders one and two levels below a folder, without results of freegeo."""
+    below = [path for path in folder.glob("*") if path.is_dir() and not (path / RUN_FILE).exists()]
+    below += [path for parent in below for path in parent.glob("*") if path.is_dir()]
+    return _by_name(path for path in below if not _is_hidden(path))
 
 
 def _as_video(source: str | Path) -> Path | None:

@@ -140,7 +140,7 @@ def export(
     if depth_size == "photo" and photos is None and any(format.holds_depth for format in wanted):
         raise UserError(
             "Depth at the size of the photos is interpolated by these, and they are not at hand: not given, moved or "
-            "changed. Put them back where they were, or take depth at the model's size."
+            "changed. Put them back where they were, or take depth at the model's size (--depth-size model)."
         )
     report = None
     keep = np.ones(reconstruction.depth_z.shape, dtype=bool) if masks is None else masks

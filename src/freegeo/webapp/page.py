@@ -328,5 +328,5 @@ def design() -> dict[str, Any]:
     fonts = ["system-ui", "-apple-system", "Segoe UI", "Roboto", "DejaVu Sans", "sans-serif"]
     theme = gr.themes.Default(
         primary_hue="blue", neutral_hue="slate", font=fonts, font_mono=["ui-monospace", "DejaVu Sans Mono", "monospace"]
-    )
+    ).set(body_text_color_subdued="#5d666f", body_text_color_subdued_dark="#a2abb4")
     return {"theme": theme, "css_paths": [HERE / "app.css"], "footer_links": [], "run_history": False}

@@ -30,7 +30,9 @@ logger = logging.getLogger(__name__)
 
 PHOTOS, RESULT, SCRATCH = "photos", "result", "scratch"
 """Folders of a run."""
-ZIP_NAME = "freegeo.zip"
+ZIPS = "freegeo"
+"""What the names of zip files of a result begin with; `ZIP_NAME` holds all of it, others one of its folders."""
+ZIP_NAME = f"{ZIPS}.zip"
 """The zip file of a result, in the folder of its run."""
 DONE_CODES = {0, 3}
 """Exit codes of a run whose result is there; 3 with something missing, which the result says."""

@@ -18,7 +18,7 @@ from freegeo.lock import LOCK_FILE
 from freegeo.models import catalog
 from freegeo.report.origin import is_own_host, is_own_page, require_free_port
 from freegeo.report.result import REPORT_NAME
-from freegeo.webapp.runs import ZIP_NAME, Run
+from freegeo.webapp.runs import ZIP_NAME, ZIPS, Run
 from freegeo.webapp.sessions import Sessions
 
 if TYPE_CHECKING:
@@ -124,9 +124,13 @@ def _add_results(app: FastAPI, sessions: Sessions) -> None:
 
     @app.get("/result/{token}/files/{name:path}")
     def fetch_file(token: str, name: str) -> FileResponse:
-        path = result_file(finished(token), name)
+        run = finished(token)
+        path = part_of(run.result, name)
         if path is None:
-            raise HTTPException(404, "there is no such file; folders are in the zip file of the result.")
+            raise HTTPException(404, "there is no such file.")
+        if path.is_dir():
+            with zipping:
+                path = zipped(run, path)
         inline = name == REPORT_NAME
         return FileResponse(path, filename=path.name, content_disposition_type="inline" if inline else "attachment")
 
@@ -134,19 +138,27 @@ def _add_results(app: FastAPI, sessions: Sessions) -> None:
     def fetch_all(token: str) -> FileResponse:
         run = finished(token)
         with zipping:
-            path = zipped(run)
+            path = zipped(run, run.result)
         return FileResponse(path, filename=ZIP_NAME)
 
 
-def result_file(run: Run, name: str) -> Path | None:
-    """Return a file of a result by its path there, as the report links to it; None for hidden files and links."""
-    path = run.result / name
-    hidden = any(part.startswith(".") for part in Path(name).parts)
+def part_of(result: Path, name: str) -> Path | None:
+    """Return a file or folder of a result by its path there, as the report links to it; None for hidden ones and links.
+
+    None, too, for a path that leads out of the result, or that no file can have.
+    """
+    parts = Path(name).parts
+    path = result / name
     try:
-        within = path.resolve().is_relative_to(run.result.resolve())
-        return path if within and not hidden and not path.is_symlink() and path.is_file() else None
-    except (OSError, ValueError):  # a name that no file can have
+        within = (
+            bool(parts)
+            and not Path(name).is_absolute()
+            and path.exists()
+            and path.resolve() == result.resolve() / Path(name)
+        )
+    except (OSError, ValueError):
         return None
+    return None if not within or any(part.startswith(".") for part in parts) else path
 
 
 def one_part(report: str, part: str) -> str:
@@ -156,13 +168,13 @@ def one_part(report: str, part: str) -> str:
     return report.replace("</head>", f"{render('part.html.j2', part=part)}</head>", 1)
 
 
-def zipped(run: Run) -> Path:
-    """Return the zip file of a result, which is made at the first call."""
-    path = run.folder / ZIP_NAME
+def zipped(run: Run, folder: Path) -> Path:
+    """Return the zip file of a result, or of a folder in it, which is made at the first call."""
+    path = run.folder / ("-".join([ZIPS, *folder.relative_to(run.result).parts]) + ".zip")
     if not path.is_file():
         part = path.with_suffix(".part")
         with zipfile.ZipFile(part, "w") as archive:
-            for file in sorted(run.result.rglob("*")):
+            for file in sorted(folder.rglob("*")):
                 if file.is_file() and not file.is_symlink() and file.name != LOCK_FILE:
                     archive.write(file, Path("freegeo", file.relative_to(run.result)))
         part.replace(path)

@@ -18,7 +18,7 @@ from freegeo.data.photos import natural_key
 from freegeo.data.video import is_video
 from freegeo.errors import UserError
 from freegeo.lock import locked
-from freegeo.webapp.runs import GRACE_S, PHOTOS, RESULT, ZIP_NAME, Choice, Queue, Run, command
+from freegeo.webapp.runs import GRACE_S, PHOTOS, RESULT, ZIPS, Choice, Queue, Run, command
 
 logger = logging.getLogger(__name__)
 
@@ -119,7 +119,8 @@ class Sessions:
             if before is not None and before.inputs == inputs and before.folder.is_dir():
                 folder = before.folder
                 # The result may become another one: what was missing may be there now.
-                (folder / ZIP_NAME).unlink(missing_ok=True)
+                for made in folder.glob(f"{ZIPS}*.zip"):
+                    made.unlink()
             else:
                 self._remove(before)
                 session.run = None
