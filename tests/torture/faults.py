@@ -195,7 +195,8 @@ def _look_at(place: Place, ended: Ended, when: str, known: Watched, outcome: Out
     names = {RUN_FILE, LEDGER_FILE, "reconstruction.json", "report.html", "index.html", "batch.json"}
     for name, digest in tree(place.work).items():
         path = Path(name)
-        whole = not any(map(is_part, (path, *path.parents))) and path.name not in names
+        # Without its photos an export is another one, and says so.
+        whole = "input gone" not in when and not any(map(is_part, (path, *path.parents))) and path.name not in names
         if whole and name in known.seen and digest not in known.seen[name]:
             outcome.faults.append(f"{when}: {name} is half-written")
 

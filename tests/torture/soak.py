@@ -17,9 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import freegeo
-from freegeo.cli.app import main as program
-from freegeo.models.da3_config import EMBEDDED_WEIGHTS
-from freegeo.report.result import write_report
+from freegeo.report.page import write_report
 from torture.commands import photos
 
 WARM_UP = 10
@@ -48,12 +46,13 @@ def used() -> Used:
 def round_of(folder: Path, given: list, model) -> None:
     """Adapt to photos, predict, save the adapter and the result, export it and write its report."""
     out = folder / "round"
-    adapter = freegeo.adapt(model, given, steps=2, sets=2, guard="off")
-    adapter.save(out / "adapter")
+    adapted = freegeo.adapt(model, given, steps=2, sets=2, guard="off")
+    adapted.save(out / "adapter")
     result = freegeo.reconstruct(model, given)
-    result.export(out, ["npz", "ply", "glb", "tum"])
+    result.save(out)
+    result.export(out, ["ply", "glb", "tum"])
     write_report(out)
-    adapter.detach()
+    adapted.adapter.detach()
     shutil.rmtree(out)
 
 
@@ -79,6 +78,8 @@ def growth(looks: list[Used]) -> dict[str, float]:
 def main() -> None:
     """Print a table and the slopes; exit code 1 when something grows."""
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 60
+    if count < 2 * WARM_UP:
+        sys.exit(f"at least {2 * WARM_UP} rounds are needed.")
     started = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         looks = soak(Path(folder), count)
