@@ -311,3 +311,21 @@ def test_names_as_long_as_a_file_may_have_can_be_written(tmp_path, length):
         name = letter * (room // len(letter.encode())) + suffix
         files.write_json(tmp_path / name, 1)
         assert files.read_json(tmp_path / name) == 1
+
+
+def test_a_process_that_is_killed_while_it_writes_tensors_leaves_nothing_that_is_not_listed(tmp_path, monkeypatch):
+    """The library writes to a temporary name of its own first."""
+    files.start_ledger(tmp_path)
+    left = []
+
+    def stopped(tensors, file, metadata):
+        (Path(file).parent / ".tmpx").touch()
+        left.extend(path.relative_to(tmp_path).parts[0] for path in tmp_path.rglob(".tmpx"))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("safetensors.torch.save_file", stopped)
+        with pytest.raises(FileNotFoundError):
+            files.write_tensors(tmp_path / "a.safetensors", {"x": torch.zeros(1)})
+    assert left
+    assert set(left) <= set(files.ledger(tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == [files.LEDGER_FILE]

@@ -183,6 +183,16 @@ def _flush(path: Path) -> None:
     path.chmod(0o666 & ~mask)
 
 
+def require_room(folder: Path) -> None:
+    """Raise OSError when the disk of a folder is full, as is asked after a library that does not say so has written."""
+    probe = folder / "room"
+    with probe.open("wb") as file:
+        file.write(bytes(_BLOCK))
+        file.flush()
+        os.fsync(file.fileno())
+    probe.unlink()
+
+
 def inside(folder: Path, name: str) -> Path:
     """Return the path of a file below a folder; UserError for a name that leads out of it, or that no file can have.
 
@@ -569,10 +579,15 @@ def write_tensors(path: Path, tensors: Mapping[str, Any], metadata: Mapping[str,
 
     with atomic_path(path) as part:
         contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+        # The library has temporary names of its own beside its file; a process that is killed must not leave one.
+        scratch = scratch_folder(path.parent, part.stem)
         try:
-            save_file(contiguous, part, metadata=dict(metadata or {}))
+            save_file(contiguous, scratch / path.name, metadata=dict(metadata or {}))
+            (scratch / path.name).replace(part)
         except SafetensorError as error:
             number = re.search(r"os error (\d+)", str(error))
             if number is None:
                 raise
             raise OSError(int(number[1]), os.strerror(int(number[1])), str(path)) from None
+        finally:
+            _remove(scratch)

@@ -1,8 +1,12 @@
-"""Main memory that a process may use: what the machine has free, and what its control group leaves."""
+"""What the machine leaves this process: main memory, within its control group, and its answers to signals."""
 
 from __future__ import annotations
 
 import os
+import signal
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
@@ -57,3 +61,14 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError:
         return ""
+
+
+@contextmanager
+def sigterm_kept() -> Generator[None]:
+    """Keep this process's answer to SIGTERM while a library is imported that puts a handler of its own there."""
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        if before is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)

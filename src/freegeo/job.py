@@ -308,8 +308,10 @@ class Job:
                 started = time.monotonic()
                 self._judge(result, frozen, judging)
                 seconds["evidence"] = round(time.monotonic() - started, 2)
-            result.save(folder)
             self.folder.note("adaptation", {"seconds": seconds})
+            result.save(folder)
+        # A process that was killed after it had written the adapter has left it.
+        remove_state(folder)
         metadata = read_json(folder / METADATA)
         return metadata.get("trouble"), metadata.get("verdict")
 

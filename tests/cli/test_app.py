@@ -68,14 +68,20 @@ def test_command_line_is_quoted_as_it_could_be_typed():
     assert console.command_line() == "freegeo run 'my photos/*.jpg' -o out"
 
 
-def test_interrupt_has_a_code_of_its_own(freegeo, monkeypatch, tmp_path):
+@pytest.mark.parametrize(
+    ("stop", "code", "words"), [(KeyboardInterrupt(), 130, "interrupted"), (SystemExit(143), 143, "asked to end")]
+)
+def test_interrupt_and_sigterm_have_codes_of_their_own_and_say_how_to_go_on(
+    freegeo, monkeypatch, tmp_path, stop, code, words
+):
     def interrupt(*arguments):
-        raise KeyboardInterrupt
+        raise stop
 
     monkeypatch.setattr("freegeo.cli.reconstruct.load_source", interrupt)
     outcome = freegeo("reconstruct", "x", "-o", tmp_path / "out")
-    assert outcome.code == 130
-    assert "interrupted" in outcome.sentence()
+    assert outcome.code == code
+    assert words in outcome.sentence()
+    assert "the same command continues" in outcome.sentence()
 
 
 # -- config files

@@ -200,3 +200,19 @@ def test_failures_are_one_sentence_and_leave_nothing(tmp_path, monkeypatch):
     with pytest.raises(UserError, match=r"pip install 'freegeo\[colmap\]'"):
         check_formats(["ply", "colmap"], scene.names)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of a process")
+def test_a_disk_that_is_full_is_an_error_though_pycolmap_does_not_notice(tmp_path):
+    """The limit stands for a disk on which the model fits, but hardly."""
+    import resource
+
+    scene, before = room(VIEWS, HW, SEED, CROP), resource.getrlimit(resource.RLIMIT_FSIZE)
+    tracks = tracks_of(scene, max_points=20)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 19, before[1]))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            write_colmap(scene, tracks, tmp_path / "0")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []

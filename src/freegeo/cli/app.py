@@ -91,7 +91,8 @@ def build(config: Path | None = None) -> App:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line and return the exit code.
 
-    0: done; 2: the user's mistake; 1: a failure; 3: everything was written but for some files; 130: Ctrl-C.
+    0: done; 2: the user's mistake; 1: a failure; 3: everything was written but for some files; 130: Ctrl-C; 143: asked
+    to end by SIGTERM.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     console.prepare_streams()
@@ -132,6 +133,10 @@ def run_command(arguments: Sequence[str]) -> int:
         return console.fail(str(error), FAILURE)
     except KeyboardInterrupt:
         return console.fail("interrupted; the same command continues an unfinished run.", INTERRUPTED)
+    except SystemExit as error:
+        if error.code != TERMINATED:
+            raise
+        return console.fail("asked to end (SIGTERM); the same command continues an unfinished run.", TERMINATED)
     except (MemoryError, RuntimeError) as error:
         sentence = out_of_memory(error)
         if sentence is None:

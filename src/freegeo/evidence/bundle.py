@@ -27,6 +27,7 @@ from freegeo.geometry.camera import project
 from freegeo.geometry.depth import valid_depth
 from freegeo.geometry.rotation import rotation_angle
 from freegeo.geometry.se3 import inverse, relative, transform_points
+from freegeo.host import sigterm_kept
 
 __all__ = ["BundleSettings", "Solution", "Start", "cluster", "depth_of", "measure", "shared_cameras", "solve"]
 
@@ -100,7 +101,8 @@ class Solution:
 def pycolmap_module() -> ModuleType:
     """Return pycolmap; UserError when it is not installed."""
     try:
-        import pycolmap
+        with sigterm_kept():
+            import pycolmap
     except ImportError:
         raise UserError("Bundle adjustment needs an extra: pip install 'freegeo[colmap]'.") from None
     return pycolmap

@@ -24,6 +24,7 @@ from freegeo.export import photos
 from freegeo.export.base import Export, Format
 from freegeo.export.pixels import corner_K, corner_pixels
 from freegeo.export.reconstruction import Reconstruction
+from freegeo.host import sigterm_kept
 
 if TYPE_CHECKING:
     from freegeo.fusion.tracks import Tracks
@@ -68,7 +69,8 @@ def write_colmap(reconstruction: Reconstruction, tracks: Tracks, folder: Path) -
         FreeGeoError: there is no track, or pycolmap cannot be loaded.
     """
     try:
-        import pycolmap
+        with sigterm_kept():
+            import pycolmap
     except ImportError as error:
         raise FreeGeoError(f"pycolmap cannot be loaded ({error}). Run: pip install 'freegeo[colmap]'.") from None
     if len(tracks) == 0:
@@ -77,6 +79,8 @@ def write_colmap(reconstruction: Reconstruction, tracks: Tracks, folder: Path) -
     with files.atomic_folder(folder) as part:
         model.write_binary(str(part))
         names = sorted(path.name for path in part.iterdir())
+        # pycolmap does not notice a full disk.
+        files.require_room(part)
     return [folder / name for name in names]
 
 
