@@ -89,7 +89,8 @@ def describe(model: str) -> None:
     console.say(f"memory to reconstruct photos of 4:3 ({width} x {height}), on a GPU in bf16 by the planner: {memory}")
     if needs.adapt is not None:
         fast, small = map(gigabytes, needs.adapt)
-        console.say(f"memory to adapt to {ADAPTED_VIEWS} of them: {fast}, or {small} where that does not fit")
+        less = "" if small == fast else f", or {small} where that does not fit"
+        console.say(f"memory to adapt to {ADAPTED_VIEWS} of them: {fast}{less}")
     console.say(f"images: longest side {spec.default_side}, patches of {spec.patch_size}")
     console.say(f"takes: {TAKES[spec.takes] if spec.cameras else 'photos, one by one'}")
     console.say(f"gives: depth and its confidence{', poses and intrinsics' if spec.cameras else ''}")
