@@ -106,6 +106,7 @@ def test_a_run_whose_folder_is_deleted_ends_at_once(freegeo, options, tmp_path, 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_damaged_scene_is_named_and_the_others_are_scored(freegeo, options, tmp_path):
     room = tmp_path / "data" / DATASET / f"{ROOMS[1]}.npz"
     room.parent.mkdir(parents=True)

@@ -28,6 +28,7 @@ from freegeo.errors import FreeGeoError, UserError
 from tiny_models import tiny_da3
 
 
+@pytest.mark.slow
 def test_given_cameras_change_the_prediction_and_are_scored_with(setup):
     posed = replace(setup, given_cameras=True, out=setup.out / "posed")
     assert predict_all(Predictor(setup), [task()]) == predict_all(Predictor(posed), [task()]) == []

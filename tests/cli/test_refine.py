@@ -52,6 +52,7 @@ def result(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_refined_cameras_fit_the_photos(freegeo, result, tmp_path):
     out = tmp_path / "refined"
     outcome = freegeo("refine", result / "out", "-o", out, "--formats", "ply")

@@ -528,6 +528,7 @@ def test_a_run_whose_folder_is_deleted_ends_with_a_sentence_and_makes_nothing_an
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_a_run_that_lost_its_frozen_prediction_is_not_finished(freegeo, photo_folder, tiny, tmp_path, monkeypatch):
     out = tmp_path / "out"
     plain = job.write_report

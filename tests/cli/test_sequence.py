@@ -153,6 +153,7 @@ def unlike(result: Reconstruction) -> Reconstruction:
     return replace(result, depth_z=(result.depth_z * noise).astype(np.float32))
 
 
+@pytest.mark.slow
 def test_a_chunk_that_fits_nowhere_is_bridged_by_the_frames_around_its_seams(freegeo, walk, tiny, tmp_path, oracle):
     oracle.change = lambda number, result: unlike(result) if number == 2 else result
     outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS)
@@ -164,6 +165,7 @@ def test_a_chunk_that_fits_nowhere_is_bridged_by_the_frames_around_its_seams(fre
     assert open_reconstruction(tmp_path / "out").names == tuple(f"{k:02d}.png" for k in range(FRAMES))
 
 
+@pytest.mark.slow
 def test_chunks_that_do_not_fit_are_delivered_as_pieces(freegeo, walk, tiny, tmp_path, oracle):
     oracle.change = lambda number, result: unlike(result) if number == 2 or number >= COUNT else result
     outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS)
@@ -315,6 +317,7 @@ def test_auto_keeps_the_chunks_of_an_earlier_run(freegeo, walk, tiny, tmp_path, 
     assert "sequence" not in told(out)
 
 
+@pytest.mark.slow
 def test_joining_in_another_way_predicts_nothing_again(freegeo, walk, tiny, tmp_path, oracle):
     out = tmp_path / "out"
     assert freegeo("reconstruct", walk, "-o", out, *tiny, *CHUNKS).code == 0

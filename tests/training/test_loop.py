@@ -83,6 +83,7 @@ def test_a_killed_run_ends_with_the_same_tensors(tmp_path, small_config, whole_r
     assert all(torch.equal(expected[name], found[name]) for name in expected)
 
 
+@pytest.mark.slow
 def test_a_larger_budget_goes_on_from_the_plateau(tmp_path, small_config, whole_run):
     folder = tmp_path / "larger"
     shutil.copytree(whole_run.parent, folder)
