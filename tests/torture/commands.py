@@ -333,10 +333,13 @@ def _forked(work: Path, said: Path, then: Callable[[], None], first: Callable[[]
 
 # -- what is in a folder
 
-VOLATILE = {"seconds", "finished", "asked", "minutes", "date", "peak_gb"}
-"""Names of JSON values that say when or how long."""
+VOLATILE = {"finished", "asked", "peak_gb"}
+"""Names of JSON values that depend on time, or on what the process did before, and have to be there nevertheless."""
+_SECONDS = "seconds"
+"""Name of JSON values that say how long stages took; one that a kill cut short may lack its time."""
 _TIMES = re.compile(
-    r"\d\d\d\d-\d\d-\d\d[T ][\d:+.]+|\b\d+(\.\d+)? (s|min)\b|<td>\d+\.\d</td>|seconds</th><td>[^<]*|^  <td>\d+</td>$",
+    r"\d\d\d\d-\d\d-\d\d[T ][\d:+.]+|\b\d+(\.\d+)? (s|min)\b|<tr><th>[^<]*</th><td>\d+\.\d</td></tr>"
+    r"|seconds</th><td>[^<]*|^  <td>\d+</td>$",
     re.M,
 )
 """Times in reports, and whole seconds in the table of a batch."""
@@ -373,9 +376,6 @@ def _content(path: Path) -> bytes:
 
 def _without_times(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _shape(part) if key in VOLATILE else _without_times(part) for key, part in value.items()}
+        kept = {key: part for key, part in value.items() if key != _SECONDS}
+        return {key: part is not None if key in VOLATILE else _without_times(part) for key, part in kept.items()}
     return [_without_times(part) for part in value] if isinstance(value, list) else value
-
-
-def _shape(value: Any) -> Any:
-    return sorted(value) if isinstance(value, dict) else value is not None
