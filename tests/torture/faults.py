@@ -25,6 +25,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+from freegeo.adaptation.state import UNFINISHED_FILE
 from freegeo.files import LEDGER_FILE, RUN_FILE, is_part
 from torture.commands import COMMANDS, Ended, Place, laid_out, tree
 from torture.crash import CHANGES
@@ -109,8 +110,9 @@ def refuse(number: int) -> None:
 
 
 def scarce_handles(share: float) -> None:
-    """Leave this process a few more handles than it has."""
-    used, most = len(os.listdir("/proc/self/fd")), resource.getrlimit(resource.RLIMIT_NOFILE)[1]  # noqa: PTH208
+    """Leave this process no handles beyond those that it has, or a few."""
+    # Looking takes one.
+    used, most = len(os.listdir("/proc/self/fd")) - 1, resource.getrlimit(resource.RLIMIT_NOFILE)[1]  # noqa: PTH208
     resource.setrlimit(resource.RLIMIT_NOFILE, (used + round(12 * share), most))
 
 
@@ -192,7 +194,7 @@ def _look_at(place: Place, ended: Ended, when: str, known: Watched, outcome: Out
     elif ended.code not in ENDS or "Traceback" in ended.said or not last.startswith("freegeo: ") or ".part" in last:
         outcome.faults.append(f"{when}: code {ended.code}, {last[:200]}")
     # Their times, warnings and lists depend on what happened.
-    names = {RUN_FILE, LEDGER_FILE, "reconstruction.json", "report.html", "index.html", "batch.json"}
+    names = {RUN_FILE, LEDGER_FILE, UNFINISHED_FILE, "reconstruction.json", "report.html", "index.html", "batch.json"}
     for name, digest in tree(place.work).items():
         path = Path(name)
         # Without its photos an export is another one, and says so.

@@ -20,8 +20,8 @@ import freegeo
 from freegeo.report.page import write_report
 from torture.commands import photos
 
-WARM_UP = 10
-"""Rounds that fill caches, and count for nothing."""
+WARM_UP = 20
+"""Rounds that fill caches and the pools of the allocators, and count for nothing."""
 MOST_MB = 0.1
 """Megabytes that a round may add, by the slope of all rounds after those."""
 

@@ -26,7 +26,7 @@ def in_own_process(code: str) -> str:
 def test_a_killed_command_ends_as_if_never_stopped(tmp_path):
     code = f"""
 from pathlib import Path
-
+from torture.crash import crash
 o = crash(Path({str(tmp_path)!r}), "adapt", count=5, every=4, completions=1)
 print(o.faults, o.points >= 4, o.kills >= 5, o.completions >= 1)
 """
