@@ -9,6 +9,7 @@ from freegeo.benchmark import predict as predicting
 from freegeo.benchmark.check import check_data, check_dataset
 from freegeo.cli.app import main
 from freegeo.data.datasets import eth3d
+from freegeo.files import keep_ledger, scratch_folder
 
 BENCH = fixture_path("benchmark", "datasets")
 ADAPTATION_OPTIONS = (
@@ -156,3 +157,12 @@ def test_the_estimate_alone_computes_nothing(freegeo, options, tmp_path):
     assert "minutes for the predictions" in out
     assert "surfaces of" in out
     assert not (tmp_path / "out" / "predictions").exists()
+
+
+def test_what_a_killed_process_left_half_written_goes(freegeo, tmp_path):
+    keep_ledger(tmp_path / "out")
+    left = scratch_folder(tmp_path / "out" / "tables", "main")
+    code, _, err = freegeo("evaluate", "-o", tmp_path / "out", "--data", tmp_path)
+    assert code == 2
+    assert "holds no predictions" in err
+    assert not left.exists()

@@ -376,6 +376,7 @@ def _content(path: Path) -> bytes:
 
 def _without_times(value: Any) -> Any:
     if isinstance(value, dict):
-        kept = {key: part for key, part in value.items() if key != _SECONDS}
-        return {key: part is not None if key in VOLATILE else _without_times(part) for key, part in kept.items()}
+        kept = {key: _without_times(part) for key, part in value.items() if key != _SECONDS}
+        # What held nothing but times may be missing with them.
+        return {key: part is not None if key in VOLATILE else part for key, part in kept.items() if part != {}}
     return [_without_times(part) for part in value] if isinstance(value, list) else value

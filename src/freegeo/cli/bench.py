@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -563,12 +564,12 @@ def _predict(
 ) -> list[Problem]:
     from freegeo.benchmark.cost import estimate, estimate_scoring
     from freegeo.benchmark.predict import predict_all
-    from freegeo.lock import locked
 
     waiting = predictor.unfinished(tasks)
     console.say(f"{len(tasks)} tasks, {len(tasks) - len(waiting)} of them finished")
     if not waiting:
-        return []
+        with _writing(bench.output):
+            return []
     predicting = estimate(predictor, waiting)
     for line in predicting.lines():
         console.say(f"  {line}")
@@ -582,7 +583,7 @@ def _predict(
     )
     if estimate_only:
         return []
-    with locked(bench.output), progress_bar("predicting", len(waiting)) as update:
+    with _writing(bench.output), progress_bar("predicting", len(waiting)) as update:
         done = 0
 
         def on_task(task: Task) -> None:
@@ -601,13 +602,27 @@ def _predict(
         return predict_all(predictor, tasks, on_step=on_step, on_task=on_task)
 
 
+@contextmanager
+def _writing(folder: Path) -> Generator[None]:
+    """Lock a folder of predictions, and remove what a process that was killed left half-written there."""
+    from freegeo.files import keep_ledger, remove_parts
+    from freegeo.lock import locked
+
+    with locked(folder):
+        keep_ledger(folder)
+        remove_parts(folder)
+        yield
+
+
 def _evaluate(bench: BenchOptions, device: str | None, *, wanted: list[Task] | None) -> list[Problem]:
     from freegeo.benchmark.score import evaluate_all
     from freegeo.benchmark.tasks import stored_tasks
     from freegeo.models.precision import choose_device
 
     total = len(wanted) if wanted is not None else len(stored_tasks(bench.output))
-    with progress_bar("scoring", max(total, 1)) as update:
+    if not bench.output.is_dir():
+        raise UserError(f"{bench.output}: holds no predictions. Run `freegeo bench predict` first.")
+    with _writing(bench.output), progress_bar("scoring", max(total, 1)) as update:
         done = 0
 
         def on_task(task: Task) -> None:
