@@ -77,7 +77,7 @@ def growth(looks: list[Used]) -> dict[str, float]:
 
 def main() -> None:
     """Print a table and the slopes; exit code 1 when something grows."""
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 60
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 120
     if count < 2 * WARM_UP:
         sys.exit(f"at least {2 * WARM_UP} rounds are needed.")
     started = time.monotonic()
