@@ -26,10 +26,11 @@ test-oracle: $(READY)
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -d out/site
 
-# Damages every kind of file that is read. TORTURE: number of cases and seed.
+# Hours: damages every kind of file that is read, kills and disturbs whole commands, and adapts again and again. TORTURE: number of cases and seed.
 TORTURE := 20000 1
 torture: $(READY)
-	cd tests && OMP_NUM_THREADS=1 ../$(BIN)/python -m torture.fuzz $(TORTURE)
+	cd tests && export OMP_NUM_THREADS=1; ../$(BIN)/python -m torture.fuzz $(TORTURE) && \
+	    ../$(BIN)/python -m torture.crash && ../$(BIN)/python -m torture.faults && ../$(BIN)/python -m torture.soak
 
 # The suite with each instruction set of PyTorch and code path of MKL, with one and two threads: one line per setting.
 # MATRIX_ARGS are passed on to pytest; reports of failures stay in out/matrix.
