@@ -56,6 +56,7 @@ def test_a_pair_teaches_or_judges_and_keeps_its_matches():
     assert [len(one.pairs) for one in split_pairs(without_matches(matches), 0)] == [0, 0]
 
 
+@pytest.mark.slow
 def test_what_photos_teach_is_nearer_to_the_truth_than_the_prediction(room):
     frozen = predicted(room)
     found = lesson("room", room.photos, frozen, seed=44)

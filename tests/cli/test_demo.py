@@ -11,6 +11,8 @@ from freegeo.cli import demo, sources
 from freegeo.cli.app import main
 from freegeo.files import RUN_FILE
 
+pytestmark = pytest.mark.slow
+
 SCORE = {"auc05": 0.1, "auc15": 0.2, "auc30": 0.5, "abs_rel": 0.2, "f1_rel5": 0.3}
 
 

@@ -114,6 +114,7 @@ def cameras(folder):
     return Reconstruction.load(folder).cameras()[0]
 
 
+@pytest.mark.slow
 def test_a_refined_reconstruction_is_the_result_and_can_be_taken_back(freegeo, result, tiny, tmp_path, monkeypatch):
     out = tmp_path / "out"
     command = ("reconstruct", result / "photos", "-o", out, *tiny, "--formats", "ply", "colmap", "--refine")

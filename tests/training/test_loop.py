@@ -20,6 +20,8 @@ from freegeo.training import loop, state
 from freegeo.training.loop import train
 from freegeo.training.state import trained_model
 
+pytestmark = pytest.mark.slow
+
 KILLED_RUN = """
 import os, signal, sys
 from pathlib import Path
@@ -69,7 +71,6 @@ def test_a_stopped_run_ends_with_the_same_tensors(small_config, whole_run, stopp
     assert all(torch.equal(expected[name], found[name]) for name in expected)
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
 def test_a_killed_run_ends_with_the_same_tensors(tmp_path, small_config, whole_run):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
@@ -83,7 +84,6 @@ def test_a_killed_run_ends_with_the_same_tensors(tmp_path, small_config, whole_r
     assert all(torch.equal(expected[name], found[name]) for name in expected)
 
 
-@pytest.mark.slow
 def test_a_larger_budget_goes_on_from_the_plateau(tmp_path, small_config, whole_run):
     folder = tmp_path / "larger"
     shutil.copytree(whole_run.parent, folder)
@@ -97,7 +97,6 @@ def test_a_larger_budget_goes_on_from_the_plateau(tmp_path, small_config, whole_
     assert steps[-1][1] >= 60
 
 
-@pytest.mark.slow
 def test_a_run_continues_another_one_with_rooms_and_rates_of_its_own(tmp_path, small_config, whole_run):
     before = torch.load(whole_run.parent / state.NEWEST_FILE, weights_only=True)["counters"].tolist()
     config = replace(small_config, views=60, first_room=6, peak=0.25, cooldown=1.0)
@@ -172,7 +171,6 @@ def test_a_leg_stops_in_time_and_is_resumed(tmp_path, small_config):
     assert (tmp_path / "legs" / state.NEWEST_FILE).is_file()
 
 
-@pytest.mark.slow
 def test_two_workers_learn_on_the_same_weights(tmp_path, small_config):
     by_first_process = []
     weights = train(small_config, tmp_path / "two", workers=2, progress=lambda now: by_first_process.append(now.seen))
@@ -217,7 +215,6 @@ def test_a_step_that_is_not_finite_is_left_out_where_that_is_allowed(tmp_path, s
         train(config, tmp_path / "always")
 
 
-@pytest.mark.slow
 def test_the_next_version_is_trained_within_its_time_and_started_from_half_precision(
     tmp_path, small_config, monkeypatch
 ):
