@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Protocol, Self
+from typing import Literal, Protocol, Self
 
 import numpy as np
 import torch
@@ -232,6 +232,14 @@ class Priors:
     """(S,) bool: views whose intrinsics are known; None: all, where there are any."""
     metric: bool = False
     """Whether lengths are metres."""
+
+    def views_with(self, what: Literal["pose", "K"]) -> Tensor:
+        """Mask (B, S) bool of the views of which poses or intrinsics are known."""
+        batch = next(t.shape[:2] for t in (self.T_cam_world, self.K, self.depth_z) if t is not None)
+        value, known = (self.T_cam_world, self.has_pose) if what == "pose" else (self.K, self.has_K)
+        if value is None:
+            return torch.zeros(batch, dtype=torch.bool)
+        return torch.ones(batch, dtype=torch.bool) if known is None else known.expand(batch)
 
     @property
     def whole_cameras(self) -> bool:

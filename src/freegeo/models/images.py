@@ -17,7 +17,7 @@ from freegeo.data.image_files import is_blank
 from freegeo.errors import UserError
 from freegeo.geometry.resample import resize_area, resize_cubic
 from freegeo.models.spec import MIXED, Mixed, ModelSpec
-from freegeo.types import ImageBatch, PhotoLike
+from freegeo.types import ImageBatch, PhotoLike, ViewTokens
 
 if TYPE_CHECKING:
     from freegeo.models.api import ReconstructionModel
@@ -279,6 +279,15 @@ def patch_grid(images: Tensor, patch: int) -> Size:
     if height % patch or width % patch:
         raise ValueError(f"image sides must be multiples of {patch}, got {height} x {width}")
     return height // patch, width // patch
+
+
+def encoded(images: Tensor, patch: int, encoder: Callable[[Tensor, Size], Tensor]) -> ViewTokens:
+    """Return the tokens that an encoder (V, 3, H, W), grid -> (V, N, C) makes of each of images (B, S, 3, H, W)."""
+    grid_hw = patch_grid(images, patch)
+    tokens = encoder(normalise(images).flatten(0, 1), grid_hw)
+    return ViewTokens(
+        tokens=tokens.unflatten(0, images.shape[:2]), image_hw=(images.shape[-2], images.shape[-1]), grid_hw=grid_hw
+    )
 
 
 def require_a_patch(photo: Size, patch: int) -> None:

@@ -25,7 +25,7 @@ from freegeo.geometry.se3 import from_Rt, inverse
 from freegeo.models import mapanything_images
 from freegeo.models.api import ReconstructionModel, Want, check_layers, check_want, level_tokens
 from freegeo.models.dpt import Fusion, confidence, read_in_chunks, resize
-from freegeo.models.images import normalise, patch_grid
+from freegeo.models.images import encoded
 from freegeo.models.mapanything_config import MapAnythingConfig
 from freegeo.models.mapanything_priors import DenseEncoder, GlobalEncoder, Hints, hints_of
 from freegeo.models.priors import usable
@@ -263,13 +263,7 @@ class MapAnything(ReconstructionModel):
 
         What is known of the views is added by `aggregate`.
         """
-        grid_hw = patch_grid(images, self.config.patch_size)
-        tokens = cast(ImageEncoder, self.encoder["model"])(normalise(images).flatten(0, 1), grid_hw)
-        return ViewTokens(
-            tokens=tokens.unflatten(0, images.shape[:2]),
-            image_hw=(images.shape[-2], images.shape[-1]),
-            grid_hw=grid_hw,
-        )
+        return encoded(images, self.config.patch_size, cast(ImageEncoder, self.encoder["model"]))
 
     def aggregate(
         self,

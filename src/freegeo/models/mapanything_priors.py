@@ -82,12 +82,10 @@ def hints_of(priors: Priors, image_hw: tuple[int, int], model: str) -> Hints:
         UserError: a view's depth is known and its intrinsics are not, without which there are no rays to measure along.
     """
     hints: dict[str, tuple[Tensor, Tensor]] = {}
-    given = next((part for part in (priors.K, priors.T_cam_world, priors.depth_z) if part is not None), None)
-    if given is None:
+    if priors.K is None and priors.T_cam_world is None and priors.depth_z is None:
         return hints
-    batch = given.shape[:2]
-    has_K = _known(priors.has_K, batch) if priors.K is not None else torch.zeros(batch, dtype=torch.bool)
-    metric = torch.full(batch, priors.metric)
+    has_K = priors.views_with("K")
+    metric = torch.full_like(has_K, priors.metric)
     rays = None
     if priors.K is not None:
         rays = rays_of(priors.K.double(), image_hw)
@@ -104,12 +102,8 @@ def hints_of(priors: Priors, image_hw: tuple[int, int], model: str) -> Hints:
     if priors.T_cam_world is not None:
         T_world_cam = inverse(priors.T_cam_world.double())
         quat = matrix_to_quat_xyzw(T_world_cam[..., :3, :3])
-        hints |= pose_hints(quat, T_world_cam[..., :3, 3], _known(priors.has_pose, batch), metric)
+        hints |= pose_hints(quat, T_world_cam[..., :3, 3], priors.views_with("pose"), metric)
     return hints
-
-
-def _known(mask_S: Tensor | None, batch: Sequence[int]) -> Tensor:
-    return torch.ones(tuple(batch), dtype=torch.bool) if mask_S is None else mask_S.expand(tuple(batch))
 
 
 def rays_of(K: Tensor, image_hw: tuple[int, int]) -> Tensor:

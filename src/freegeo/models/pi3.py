@@ -22,7 +22,7 @@ from freegeo.geometry.se3 import from_Rt, inverse, transform_points
 from freegeo.models import pi3_images
 from freegeo.models.api import ReconstructionModel, Want, check_layers, check_want, level_tokens
 from freegeo.models.dpt import confidence, read_in_chunks
-from freegeo.models.images import normalise, patch_grid
+from freegeo.models.images import encoded
 from freegeo.models.pi3_config import Pi3Config
 from freegeo.models.priors import require_usable
 from freegeo.models.reference import require_no_choice
@@ -187,13 +187,7 @@ class Pi3(ReconstructionModel):
 
     def embed(self, images: Tensor, *, layers: Collection[int] | None = None) -> ViewTokens:
         """Run the patch encoder on images (B, S, 3, H, W) in [0, 1]; `layers` changes nothing."""
-        grid_hw = patch_grid(images, self.config.patch_size)
-        patches = self.encoder(normalise(images).flatten(0, 1), grid_hw)
-        return ViewTokens(
-            tokens=patches.unflatten(0, images.shape[:2]),
-            image_hw=(images.shape[-2], images.shape[-1]),
-            grid_hw=grid_hw,
-        )
+        return encoded(images, self.config.patch_size, self.encoder)
 
     def aggregate(
         self,

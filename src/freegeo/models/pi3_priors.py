@@ -40,11 +40,9 @@ def given_of(priors: Priors, image_hw: tuple[int, int], device: torch.device) ->
     Unlike in the reference implementation, where views without a pose have an arbitrary one, these count neither as the
     frame nor in the scale of the poses.
     """
-    views = next(t.shape[:2] for t in (priors.T_cam_world, priors.K, priors.depth_z) if t is not None)
-    has_pose = _known(priors.T_cam_world, priors.has_pose, views)
-    has_rays = _known(priors.K, priors.has_K, views)
+    has_pose, has_rays = priors.views_with("pose"), priors.views_with("K")
     depth_z = None if priors.depth_z is None else priors.depth_z.float()
-    has_depth = torch.zeros(views, dtype=torch.bool) if depth_z is None else (depth_z > 0).flatten(2).any(-1)
+    has_depth = torch.zeros_like(has_pose) if depth_z is None else (depth_z > 0).flatten(2).any(-1)
     T_world_cam = None
     if priors.T_cam_world is not None:
         T_world_cam = inverse(priors.T_cam_world.double())
@@ -57,12 +55,6 @@ def given_of(priors: Priors, image_hw: tuple[int, int], device: torch.device) ->
         T_world_cam, rays, depth_z, has_pose=has_pose, has_rays=has_rays, has_depth=has_depth, counted=has_pose,
         device=device,
     )  # fmt: skip
-
-
-def _known(values: Tensor | None, known: Tensor | None, views: tuple[int, ...]) -> Tensor:
-    if values is None:
-        return torch.zeros(views, dtype=torch.bool)
-    return torch.ones(views, dtype=torch.bool) if known is None else known.expand(views)
 
 
 def pixel_slopes(K: Tensor, image_hw: tuple[int, int]) -> Tensor:

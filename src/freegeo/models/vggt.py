@@ -21,7 +21,7 @@ from freegeo.geometry.camera import decode_world_to_camera
 from freegeo.models import vggt_images
 from freegeo.models.api import ReconstructionModel, Want, check_layers, check_want, level_tokens
 from freegeo.models.dpt import DenseHead, confidence, depth_maps, read_in_chunks
-from freegeo.models.images import normalise, patch_grid
+from freegeo.models.images import encoded
 from freegeo.models.priors import require_usable
 from freegeo.models.spec import MIXED, Mixed, ModelSpec
 from freegeo.models.transformer import (
@@ -177,13 +177,7 @@ class VGGT(ReconstructionModel):
         Every layer mixes views, so `layers` changes nothing. The special tokens depend on the order of the views and
         are added by `aggregate`.
         """
-        grid_hw = patch_grid(images, self.config.patch_size)
-        patches = self.aggregator.patch_embed(normalise(images).flatten(0, 1), grid_hw)
-        return ViewTokens(
-            tokens=patches.unflatten(0, images.shape[:2]),
-            image_hw=(images.shape[-2], images.shape[-1]),
-            grid_hw=grid_hw,
-        )
+        return encoded(images, self.config.patch_size, self.aggregator.patch_embed)
 
     def aggregate(
         self,
