@@ -28,11 +28,12 @@ ROOT = Path(__file__).resolve().parent.parent
 SEED = 42
 LIMITS_S = {
     "parity": 200, "commands": 240, "steps": 150, "job": 120, "plain": 60, "reconstruct": 60, "precision": 60,
-    "fusion": 90, "saved": 40, "profile": 60, "training": 60, "compile": 90,
+    "fusion": 90, "families": 70, "saved": 40, "profile": 60, "training": 60, "compile": 90,
 }  # fmt: skip
 """Parts in the order in which they run, and how long each may take."""
 BIG, MIDDLE, OTHER = "da3-giant", "da3-base", "vggt-1b"
-RECIPES = {BIG: "released-da3", MIDDLE: "released-da3", OTHER: "released-vggt"}
+FAMILIES = ("pi3", "pi3x", "map-anything")
+RECIPES = {BIG: "released-da3", MIDDLE: "released-da3", OTHER: "released-vggt"} | dict.fromkeys(FAMILIES, "paper")
 
 
 class Bench:
@@ -148,6 +149,8 @@ def small_model(name: str):
             out_layers=(0, 1, 2, 3), head_features=16, head_channels=(8, 16, 16, 16),
         )  # fmt: skip
         return VGGT(config, replace(build_empty(name).spec, loss_layers=config.out_layers))
+    if name in FAMILIES:
+        return small_family(name, build_empty(name))
     from freegeo.models.da3 import DA3
     from freegeo.models.da3_config import DA3Config
 
@@ -156,6 +159,28 @@ def small_model(name: str):
         head_features=16, head_channels=(8, 16, 16, 16),
     )  # fmt: skip
     return DA3(config, replace(build_empty(name).spec, loss_layers=config.out_layers))
+
+
+def small_family(name: str, published):
+    """A small model of the other families, with the structure of a published one (built on the meta device)."""
+    if name == "map-anything":
+        from freegeo.models import mapanything_config
+
+        config = replace(
+            published.config, width=64, heads=1, encoder_depth=2, depth=6, out_layers=(1, 3, 5), head_features=16,
+            head_channels=(8, 16, 16, 16), dense_encoder=(8, 8, 8), global_encoder=(8, 8, 8),
+        )  # fmt: skip
+        return mapanything_config.build(config, replace(published.spec, loss_layers=config.out_layers))
+    from freegeo.models import pi3_config
+
+    config = replace(
+        published.config, width=64, pairs=2, heads=1, encoder_depth=2, encoder_heads=1, head_width=64, head_depth=1,
+        head_heads=1, dense_out=16, camera_out=16,
+    )  # fmt: skip
+    if config.x:
+        small = {"head_channels": (16, 16, 16), "scale_width": 16, "scale_depth": 1, "scale_heads": 2, "scale_out": 16}
+        config = replace(config, x=replace(config.x, pose_pairs=(0,), **small))
+    return pi3_config.build(config, replace(published.spec, loss_layers=(config.readout,)))
 
 
 def noise_scenes(count: int, frames: int, hw: tuple[int, int]):
@@ -303,15 +328,18 @@ def noise_batch(views: int, hw: tuple[int, int]):
 
 def reconstruct(bench: Bench) -> None:
     """Seconds and peak memory of reconstructing 8, 32 and 100 views of 504 x 378 pixels."""
+    hw = (bench.side(378), bench.side(504))
+    for name in (BIG, OTHER, MIDDLE):
+        reconstruct_model(bench, bench.model(name), name, hw, (2, 3) if bench.dry else (8, 32, 100))
+
+
+def reconstruct_model(bench: Bench, model, name: str, hw: tuple[int, int], counts: tuple[int, ...]) -> None:
+    """The same for one model and some numbers of views."""
     from freegeo.adaptation.memory import plan_reconstruction
     from freegeo.pipeline import predict
 
-    hw = (bench.side(378), bench.side(504))
-    for name in (BIG, OTHER, MIDDLE):
-        model = bench.model(name)
-        for views in (2, 3) if bench.dry else (8, 32, 100):
-            if bench.late():
-                return
+    for views in counts:
+        if not bench.late():
             batch = noise_batch(views, hw)
             with bench.case(f"{name}, {views} views") as found:
                 parts, fitting = plan_reconstruction(model, views, hw, compute=bench.compute)
@@ -322,6 +350,20 @@ def reconstruct(bench: Bench) -> None:
                     "s": took, "peak_gb": peak, "planned_gb": planned, "planned_over_peak": peak and planned / peak,
                     "planned_parts_gb": {part: size / 1e9 for part, size in parts}, "would_fit": fitting,
                 }  # fmt: skip
+
+
+def families(bench: Bench) -> None:
+    """Adaptation (8 -> 4 views, recipe `paper`) and reconstruction of Pi3, Pi3X and MapAnything."""
+    hw = (bench.side(378), bench.side(504))
+    kept, disk = {"place": "device", "checkpointing": False}, {"place": "disk", "checkpointing": True}
+    for name in FAMILIES:
+        model = bench.model(name)
+        for label, options in {"kept": kept, "checkpointing, disk": disk}.items():
+            if not bench.late():
+                with bench.case(f"{name}, {label}") as found:
+                    recipe = one_set_recipe(model, RECIPES[name])
+                    adaptation_case(bench, model, noise_scenes(4, 8, hw), recipe, found, **options)
+        reconstruct_model(bench, model, name, hw, (2, 3) if bench.dry else (8, 32))
         del model
 
 
@@ -595,8 +637,8 @@ def commands(bench: Bench) -> None:
 
 PARTS: dict[str, Callable[[Bench], None]] = {
     "parity": parity, "commands": commands, "steps": steps, "job": job, "plain": plain, "reconstruct": reconstruct,
-    "precision": precision, "fusion": fusion, "saved": saved, "profile": profile, "training": training,
-    "compile": compiled,
+    "precision": precision, "fusion": fusion, "families": families, "saved": saved, "profile": profile,
+    "training": training, "compile": compiled,
 }  # fmt: skip
 
 

@@ -1,17 +1,19 @@
 """Train the next version of the embedded model on a GPU within a time limit: `python benchmarks/train_embedded.py OUT`.
 
-Two short trials say whether compiled blocks are faster (`--trial none`, `eager` or `both`); the rest of `--seconds` is
-one run of the preset `v5`, which cools down by then. OUT receives the weights, the restart file for a later run
-(`--continue-from`), the log and `speed.json`. Only torch, numpy and safetensors are imported.
+One run of the preset `v5` with compiled blocks, in a process of its own, which cools down by the end of `--seconds`. If
+that process dies, another goes on from its last saved state without compiled blocks. OUT receives the weights, the
+restart file for a later run (`--continue-from`), the log and the settings. Only torch, numpy and safetensors are
+imported.
 """
 
 import argparse
 import json
 import logging
 import shutil
+import subprocess
+import sys
 import tempfile
 import time
-import traceback
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,99 +21,93 @@ import torch
 
 from freegeo.training import loop
 from freegeo.training.config import PRESETS, TrainConfig
-from freegeo.training.state import RESTART_FILE
+from freegeo.training.state import RESTART_FILE, new_state
 
-SAVING_S = 10.0
-TRIALS = {"eager": 25.0, "compiled": 75.0}
-GAIN = 1.15
-"""Compiled blocks must be so much faster, as the run compiles some of them once more."""
+ROOMS_S, SAVING_S = 8.0, 6.0
+"""What the first rooms take, and what the files of the end do."""
+SAVE_EVERY_S = 45.0
 
 
 def main() -> None:
-    """Run the trials and the training."""
+    """Run the training in a child process, and once more without compilation if that fails."""
     begun = time.monotonic()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", type=Path)
-    parser.add_argument("--seconds", type=float, default=380.0, help="for everything; default %(default)s")
-    parser.add_argument("--trial", choices=("none", "eager", "both"), default="both")
-    parser.add_argument("--compile", action="store_true", help="compile without a trial")
-    parser.add_argument("--views-per-step", type=int)
+    parser.add_argument("--seconds", type=float, default=540.0, help="for everything; default %(default)s")
+    parser.add_argument("--eager", action="store_true", help="without compiled blocks")
+    parser.add_argument("--views-per-step", type=int, default=PRESETS["v5"].views_per_step)
     parser.add_argument("--continue-from", type=Path, help=f"folder with the {RESTART_FILE} of an earlier run")
     parser.add_argument("--first-room", type=int, default=0)
     parser.add_argument("--peak", type=float, default=1.0)
     parser.add_argument("--device", default="cuda")
+    parser.add_argument("--run", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--left", type=float, help=argparse.SUPPRESS)
     given = parser.parse_args()
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    torch.set_num_threads(8)
-    config = replace(PRESETS["v5"], first_room=given.first_room, peak=given.peak)
-    if given.views_per_step:
-        config = replace(config, views_per_step=given.views_per_step)
     given.output.mkdir(parents=True, exist_ok=True)
-    speeds: dict[str, float] = {}
-    for name, seconds in TRIALS.items():
-        if given.trial == "both" or given.trial == name:
-            speeds[name] = trial(config, seconds, compiled=name == "compiled", device=given.device)
-            (given.output / "speed.json").write_text(json.dumps(speeds))
-    compiled = given.compile or speeds.get("compiled", 0.0) > GAIN * speeds.get("eager", float("inf"))
-    left = given.seconds - SAVING_S - (time.monotonic() - begun)
-    print(f"views a second: {speeds}; compiled: {compiled}; {left:.0f} s left for the run", flush=True)
+    if given.run:
+        leg(given)
+        return
     run = Path(tempfile.mkdtemp()) / "run"
-    config = replace(config, minutes=left / 60)
+    for compiled in (True, False) if not given.eager else (False,):
+        left = given.seconds - (time.monotonic() - begun)
+        command = [sys.executable, __file__, *sys.argv[1:], "--run", str(run), "--left", str(left)]
+        code = subprocess.run([*command, *["--eager"] * (not compiled and not given.eager)], check=False).returncode
+        copy(run, given.output)
+        if code == 0:
+            break
+        print(f"the process with compiled blocks {compiled} ended with {code}", flush=True)
+    print((given.output / loop.LOG).read_text().splitlines()[-1])
+
+
+def leg(given: argparse.Namespace) -> None:
+    """Train in this process until the time is over."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", force=True)
+    torch.set_num_threads(8)
+    torch.backends.cuda.enable_cudnn_sdp(False)  # it plans anew, for .1 s and more, for every shape of a sample
+    loop.SAVE_EVERY_S = SAVE_EVERY_S
+    begun = time.monotonic()
+    config = replace(
+        PRESETS["v5"], first_room=given.first_room, peak=given.peak, views_per_step=given.views_per_step
+    )  # fmt: skip
+    if not given.eager:
+        loop.compile_all(new_state(config, given.device))  # kept by PyTorch, so that the schedule can take what is left
+        print(f"compiled after {time.monotonic() - begun:.1f} s", flush=True)
+    if (given.run / loop.CONFIG).is_file():
+        minutes = json.loads((given.run / loop.CONFIG).read_text())["minutes"]
+    else:
+        minutes = (given.left - (time.monotonic() - begun) - ROOMS_S - SAVING_S) / 60
+    config = replace(config, minutes=minutes)
     if given.continue_from:
         seen = int(torch.load(given.continue_from / RESTART_FILE, weights_only=True)["counters"][1])
         config = replace(config, views=config.views + seen, pairs_until=0, short_until=0, small_until=0)
     loop.train(
-        config, run, device=given.device, compile_blocks=compiled, continue_from=given.continue_from,
-        progress=Copies(config, run, given.output),
+        config, given.run, device=given.device, compile_blocks=not given.eager, continue_from=given.continue_from,
+        minutes=(given.left - SAVING_S - (time.monotonic() - begun)) / 60,
+        progress=Copies(config, given.run, given.output),
     )  # fmt: skip
-    copy(run, given.output)
-    print((given.output / loop.LOG).read_text().splitlines()[-1])
 
 
 class Copies:
-    """Keeps OUT's log up to date, and its weights every minute: what is there if the run is cut off."""
+    """Keeps log and weights in OUT, once a minute: what is there if the machine is taken away."""
 
     def __init__(self, config: TrainConfig, run: Path, output: Path):
         self.config, self.run, self.output, self.at = config, run, output, time.monotonic()
 
     def __call__(self, state) -> None:
-        """Copy once a minute."""
+        """Write the weights so far, copy the log, and print its last line."""
         if time.monotonic() - self.at > 60:
             self.at = time.monotonic()
             loop.write_weights(state, self.config, self.output / loop.WEIGHTS)
             if (self.run / loop.LOG).is_file():
                 shutil.copy(self.run / loop.LOG, self.output)
+                print((self.run / loop.LOG).read_text().splitlines()[-1], flush=True)
 
 
 def copy(run: Path, output: Path) -> None:
     """Copy what a run leaves and a small disk can hold."""
     for name in (loop.WEIGHTS, RESTART_FILE, loop.LOG, loop.CONFIG):
-        shutil.copy(run / name, output)
-
-
-def trial(config: TrainConfig, seconds: float, *, compiled: bool, device: str) -> float:
-    """Return views a second at full size with all numbers of views; 0 when the trial fails, which is printed."""
-    config = replace(
-        config, minutes=seconds / 60, pairs_until=0, short_until=0, small_until=0, rooms_at_start=288, render_share=0.02
-    )
-    every, loop.LOG_EVERY_STEPS = loop.LOG_EVERY_STEPS, 20
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            run = Path(folder) / "run"
-            loop.train(config, run, device=device, compile_blocks=compiled)
-            rows = [json.loads(line) for line in (run / loop.LOG).read_text().splitlines()]
-    except Exception:
-        traceback.print_exc()
-        return 0.0
-    finally:
-        loop.LOG_EVERY_STEPS = every
-        torch.compiler.reset()  # the compiled code of this model; the cache on disk stays
-        if device == "cuda":
-            print(f"peak memory {torch.cuda.max_memory_allocated() / 1e9:.1f} GB", flush=True)
-            torch.cuda.empty_cache()
-    first, last = rows[len(rows) // 2 - 1], rows[-1]
-    print(f"compiled {compiled}: {json.dumps(last)}", flush=True)
-    return (last["views"] - first["views"]) / max(last["s"] - first["s"], 1e-3)
+        if (run / name).is_file():
+            shutil.copy(run / name, output)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 SCRIPT = ROOT / "benchmarks" / "gpu.py"
-PARTS = ("steps", "job", "plain", "reconstruct", "precision", "fusion", "compile")
+PARTS = ("steps", "job", "plain", "reconstruct", "precision", "fusion", "families", "compile")
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess:

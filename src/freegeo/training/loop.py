@@ -23,7 +23,7 @@ from freegeo.lock import locked
 from freegeo.models.da3 import Backbone
 from freegeo.training.batches import Batch, draw_batch
 from freegeo.training.config import TrainConfig
-from freegeo.training.objective import objective, zero_motion_rotation
+from freegeo.training.objective import encode, objective, zero_motion_rotation
 from freegeo.training.pool import ASPECTS, Pool
 from freegeo.training.report_card import score_rooms
 from freegeo.training.state import (
@@ -72,7 +72,6 @@ def train(
     starts from, with settings and rooms of its own. UserError when the folder holds a run with other settings or
     `continue_from` holds none; FreeGeoError when too many losses are not finite or a worker dies.
     """
-    begun = time.monotonic()
     if workers < 1 or (workers > 1 and device != "cpu"):
         raise UserError(f"cannot train with {workers} workers on {device}. Use one, or several on the cpu.")
     with locked(folder), one_thread(device):
@@ -84,6 +83,7 @@ def train(
         if compile_blocks:
             compile_all(state)
         pool = open_pool(config, state, folder, device)
+        begun = time.monotonic()
         with Crew(state, config, folder, workers - 1) as crew:
             trainer = Trainer(state, pool, config, folder, crew.lock)
             deadline = time.monotonic() + 60 * (minutes if minutes is not None else float("inf"))
@@ -119,13 +119,21 @@ def position(state: State, config: TrainConfig) -> float:
 
 
 def compile_all(state: State) -> None:
-    """Compile the blocks of the backbone, for images and samples of any size."""
+    """Compile the blocks of the backbone, for images and samples of any size, before the time of a run begins."""
     from torch._dynamo import config as settings
 
     # All blocks share one piece of code: about seven versions of it, next to the default limit of eight.
     settings.recompile_limit = 32  # ty: ignore[invalid-assignment]
     for block in cast(Backbone, state.model.backbone["pretrained"]).blocks:
         block.compile(dynamic=True)
+    device = next(state.model.parameters()).device
+    for shape in ((4, 2, 72, 72), (2, 4, 72, 96), (2, 8, 64, 96)):
+        samples, views, *size = shape
+        with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
+            features = encode(state.model, torch.rand(samples, views, 3, *size, device=device), None)
+        torch.stack([patches.float().mean() for patches, _ in features.levels.values()]).sum().backward()
+    for parameter in state.parameters():
+        parameter.grad = None
 
 
 class Trainer:
