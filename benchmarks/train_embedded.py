@@ -1,7 +1,7 @@
-"""Train the next version of the embedded model on a GPU within a time limit: `python benchmarks/train_embedded.py OUT`.
+"""Train the embedded model on a GPU within a time limit: `python benchmarks/train_embedded.py OUT`.
 
-One run of the preset `v5` with compiled blocks, in a process of its own, which cools down by the end of `--seconds`. If
-that process dies, another goes on from its last saved state without compiled blocks. OUT receives the weights, the
+One run of the preset `gpu` with compiled blocks, in a process of its own, which cools down by the end of `--seconds`.
+If that process dies, another goes on from its last saved state without compiled blocks. OUT receives the weights, the
 restart file for a later run (`--continue-from`), the log and the settings. Only torch, numpy and safetensors are
 imported.
 """
@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("--seconds", type=float, default=540.0, help="for everything; default %(default)s")
     parser.add_argument("--eager", action="store_true", help="without compiled blocks")
-    parser.add_argument("--views-per-step", type=int, default=PRESETS["v5"].views_per_step)
+    parser.add_argument("--views-per-step", type=int, default=PRESETS["gpu"].views_per_step)
     parser.add_argument("--continue-from", type=Path, help=f"folder with the {RESTART_FILE} of an earlier run")
     parser.add_argument("--first-room", type=int, default=0)
     parser.add_argument("--peak", type=float, default=1.0)
@@ -67,7 +67,7 @@ def leg(given: argparse.Namespace) -> None:
     loop.SAVE_EVERY_S = SAVE_EVERY_S
     begun = time.monotonic()
     config = replace(
-        PRESETS["v5"], first_room=given.first_room, peak=given.peak, views_per_step=given.views_per_step
+        PRESETS["gpu"], first_room=given.first_room, peak=given.peak, views_per_step=given.views_per_step
     )  # fmt: skip
     if not given.eager:
         loop.compile_all(new_state(config, given.device))  # kept by PyTorch, so that the schedule can take what is left

@@ -13,7 +13,7 @@ def small_run(monkeypatch):
     small = TrainConfig(
         views_per_step=4, rooms=6, rooms_per_shard=2, frames=4, warmup_views=8, depth_views=1, evaluate_every=20
     )
-    monkeypatch.setitem(config.PRESETS, "v4", small)
+    monkeypatch.setitem(config.PRESETS, "gpu", small)
     monkeypatch.setattr(loop, "LOG_EVERY_STEPS", 2)
     monkeypatch.setattr(loop, "EVALUATION_ROOMS", 2)
 

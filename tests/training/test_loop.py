@@ -18,7 +18,6 @@ from freegeo.files import read_json
 from freegeo.models.catalog import load_model
 from freegeo.training import loop, state
 from freegeo.training.loop import train
-from freegeo.training.state import trained_model
 
 pytestmark = pytest.mark.slow
 
@@ -130,8 +129,6 @@ def test_a_part_of_a_weight_file_learns_and_the_rest_stays_bit_equal(tmp_path, s
 def test_mistakes_about_the_run_to_continue_are_named(tmp_path, small_config, whole_run):
     with pytest.raises(UserError, match="needs one to start from"):
         train(replace(small_config, learns="cam_enc."), tmp_path / "part")
-    with pytest.raises(UserError, match="not weights of shape 'v5'"):
-        train(replace(small_config, shape="v5"), tmp_path / "shape", continue_from=whole_run)
     with pytest.raises(UserError, match="no run to continue"):
         train(small_config, tmp_path / "next", continue_from=tmp_path)
     with pytest.raises(UserError, match="continues no other"):
@@ -215,21 +212,21 @@ def test_a_step_that_is_not_finite_is_left_out_where_that_is_allowed(tmp_path, s
         train(config, tmp_path / "always")
 
 
-def test_the_next_version_is_trained_within_its_time_and_started_from_half_precision(
+def test_a_run_for_a_gpu_is_trained_within_its_time_and_started_from_half_precision(
     tmp_path, small_config, monkeypatch
 ):
     ticks = itertools.count()
     clock = SimpleNamespace(monotonic=lambda: next(ticks) / 10, process_time=time.process_time)
     monkeypatch.setattr(loop, "time", clock)
     config = replace(
-        small_config, shape="v5", side=32, views=10**9, minutes=0.04, cameras_given=0.5, any_reference=0.5,
+        small_config, side=32, views=10**9, minutes=0.04, cameras_given=0.5, any_reference=0.5,
         render_share=0.2, rooms_at_start=4, views_per_step=8, depth_views=2, broken_steps=1,
         pairs_until=10**9,
     )  # fmt: skip
     places = []
     weights = train(config, tmp_path / "run", progress=lambda now: places.append(loop.position(now, config)))
     assert places == sorted(places) and len(places) > 2
-    model = trained_model(weights)
+    model = load_model("freegeo-tiny", checkpoint=weights)
     assert model.config.width == 192 and weights.stat().st_size < 14.5e6
     prediction = model.decode(model.aggregate(model.embed(torch.rand(1, 3, 3, 24, 32))))
     assert torch.isfinite(prediction.depth_z).all()

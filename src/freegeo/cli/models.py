@@ -188,7 +188,6 @@ def score(
     from freegeo.files import require_writable
     from freegeo.training.camera_card import CAMERA_DOMAINS, camera_card, camera_tables
     from freegeo.training.report_card import REPORTED_DOMAINS, card_tables, gate_lines, report_card
-    from freegeo.training.state import trained_model
 
     reported = CAMERA_DOMAINS if cameras else REPORTED_DOMAINS
     names = reported if domains is None else tuple(name.strip() for name in domains.split(","))
@@ -197,10 +196,7 @@ def score(
     require_writable(output.parent)
     for name in names:
         get_domain(name).seeds(rooms)
-    if checkpoint and catalog.entry(model).name == catalog.EMBEDDED_MODEL:
-        loaded = trained_model(checkpoint)
-    else:
-        loaded = catalog.load_model(model, checkpoint=checkpoint)
+    loaded = catalog.load_model(model, checkpoint=checkpoint)
     if not loaded.spec.cameras:
         raise UserError(f"{loaded.spec.name} predicts no cameras, which the report card scores. Choose another model.")
     use_few_threads(loaded)

@@ -14,7 +14,7 @@ from freegeo.progress import progress_bar
 def train_tiny(
     output: Path,
     *,
-    preset: str = "v4",
+    preset: str = "gpu",
     views: int | None = None,
     minutes: float | None = None,
     budget: float | None = None,
@@ -36,8 +36,8 @@ def train_tiny(
     output
         Folder of the run: state, log, rendered rooms, weights.
     preset
-        v4, the shipped weights' recipe for the CPU; v4-cameras, that of their camera encoder, which starts from the
-        rest of them; or v5, that of the next version for a GPU.
+        gpu, the recipe of the shipped weights; cpu, smaller photos and steps; or cameras, which trains the camera
+        encoder of given weights and nothing else.
     views
         Views to learn from, counted with repetition; default: those of the shipped recipe.
     minutes

@@ -94,16 +94,10 @@ SINGLE_VIEW = DA3Config(
     head_features=256, head_channels=(256, 512, 1024, 1024), cat_token=False,
 )  # fmt: skip
 EMBEDDED = DA3Config(
-    width=128, depth=10, heads=4, alt_start=3, qknorm_start=3, rope_start=3, out_layers=(3, 5, 7, 9),
-    head_features=32, head_channels=(16, 32, 48, 64), patch_size=8, position_grid=8,
-    camera_encoder_depth=1, camera_encoder_heads=4,
-)  # fmt: skip
-EMBEDDED_V5 = DA3Config(
     width=192, depth=12, heads=6, alt_start=4, qknorm_start=4, rope_start=4, out_layers=(5, 7, 9, 11),
     head_features=32, head_channels=(24, 48, 72, 96), patch_size=8, position_grid=12,
     camera_encoder_depth=1, camera_encoder_heads=6,
 )  # fmt: skip
-"""The embedded model's next version, which `freegeo train-tiny --preset v5` trains; the package holds no weights."""
 
 _NORM = "head.scratch.output_conv2_aux"
 KEYS = KeyRules(
@@ -207,15 +201,15 @@ def _nested(name: str, parameters: int, hub_id: str) -> ModelEntry:
     )
 
 
-def embedded_spec(config: DA3Config) -> ModelSpec:
-    """Return how an embedded model is described; its images are as large as its grid of positions."""
+def embedded_spec() -> ModelSpec:
+    """Return how the embedded model is described; its images are as large as its grid of positions."""
     return ModelSpec(
         name=EMBEDDED_MODEL,
-        patch_size=config.patch_size,
-        default_side=config.patch_size * config.position_grid,
+        patch_size=EMBEDDED.patch_size,
+        default_side=EMBEDDED.patch_size * EMBEDDED.position_grid,
         # AUC@30 of 8 views, 12 rooms of `test-id`: .50 at 48 pixels, .60 at 64, .56 at 80, .43 at 96, .04 at 128
         sides=(48, 80),
-        loss_layers=config.out_layers,
+        loss_layers=EMBEDDED.out_layers,
         reference="first",
         special_tokens=1,
         weights_licence=APACHE,
@@ -233,7 +227,7 @@ def _embedded() -> ModelEntry:
         about="embedded, trained on generated rooms only: for demonstrations and tests, not for real photos",
         licence=APACHE,
         parameters=0,
-        build=partial(build, EMBEDDED, embedded_spec(EMBEDDED)),
+        build=partial(build, EMBEDDED, embedded_spec()),
         keys=KEYS,
         packaged_weights=EMBEDDED_WEIGHTS,
     )

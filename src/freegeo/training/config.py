@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from freegeo.errors import UserError
-from freegeo.models.da3_config import EMBEDDED, EMBEDDED_V5, DA3Config
 
-SHAPES: dict[str, DA3Config] = {"v4": EMBEDDED, "v5": EMBEDDED_V5}
-"""Models that can be trained: the shipped one, and its next version."""
 _SMALLEST = {
     "views": 1,
     "views_per_step": 2,
@@ -59,8 +56,6 @@ class Phase:
 class TrainConfig:
     """Train the embedded model on generated rooms."""
 
-    shape: str = "v4"
-    """Which of `SHAPES`."""
     learns: str = ""
     """Beginning of the names of the parameters that learn, such as "cam_enc."; the others keep their values. Empty: all
     parameters, and the maps that are only there for training."""
@@ -125,8 +120,6 @@ class TrainConfig:
     weights: LossWeights = LossWeights()
 
     def __post_init__(self):
-        if self.shape not in SHAPES:
-            raise UserError(f"cannot train a model of shape '{self.shape}'. Choose one of {', '.join(SHAPES)}.")
         for name, smallest in _SMALLEST.items():
             value, largest = getattr(self, name), _LARGEST.get(name)
             if value < smallest or (largest is not None and value > largest):
@@ -167,9 +160,7 @@ class TrainConfig:
 
 
 PRESETS = {
-    "v4": TrainConfig(),
-    "v5": TrainConfig(
-        shape="v5",
+    "gpu": TrainConfig(
         views=9_000_000,
         minutes=8.0,
         side=96,
@@ -192,7 +183,8 @@ PRESETS = {
         broken_steps=20,
         weights=LossWeights(field_of_view=3.0),
     ),
-    "v4-cameras": TrainConfig(
+    "cpu": TrainConfig(),
+    "cameras": TrainConfig(
         learns="cam_enc.",
         cameras_given=1.0,
         views=1_070_000,
@@ -207,5 +199,5 @@ PRESETS = {
         weights=LossWeights(depth=6.0, absolute=2.0, rotation=1.0),
     ),
 }
-"""Settings by name: those of the shipped weights on the CPU, of the next version on a GPU, and of the camera encoder in
-the shipped weights, whose run starts from the rest of them."""
+"""Settings by name: those of the shipped weights on a GPU; those that earlier, smaller versions had on a CPU; and those
+of a run that goes on with the camera encoder alone."""

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from torch import Tensor, nn
 
-from freegeo.errors import UserError
 from freegeo.files import atomic_path
 from freegeo.models.catalog import EMBEDDED_MODEL
 from freegeo.models.checkpoints import build_on_meta, find_file, load_weights
 from freegeo.models.da3 import DA3, Backbone
-from freegeo.models.da3_config import KEYS, build, embedded_spec
+from freegeo.models.da3_config import EMBEDDED, KEYS, build, embedded_spec
 from freegeo.models.transformer import Block, initialise
-from freegeo.training.config import SHAPES, TrainConfig
+from freegeo.training.config import TrainConfig
 from freegeo.training.muon import Muon
 from freegeo.training.objective import ReadOuts
 
@@ -108,7 +105,7 @@ class State:
 def new_state(config: TrainConfig, device: torch.device | str = "cpu") -> State:
     """Build model, training-only read-outs and optimisers from the seed; what does not learn has no gradients."""
     generator = torch.Generator().manual_seed(config.seed)
-    model = build_shape(config.shape).to_empty(device="cpu")
+    model = build_on_meta(partial(build, EMBEDDED, embedded_spec())).to_empty(device="cpu")
     reset_norms(model)
     initialise(model, generator)
     seek_alike(model)
@@ -121,11 +118,6 @@ def new_state(config: TrainConfig, device: torch.device | str = "cpu") -> State:
     average = {name: value.detach().clone() for name, value in model.named_parameters()}
     optimisers = build_optimisers(model, read_outs, config)
     return State(model, read_outs, average, optimisers, torch.zeros(4, dtype=torch.float64))
-
-
-def build_shape(shape: str) -> DA3:
-    """Build one of `SHAPES` on the meta device."""
-    return build_on_meta(partial(build, SHAPES[shape], embedded_spec(SHAPES[shape])))
 
 
 def reset_norms(model: nn.Module) -> None:
@@ -179,23 +171,6 @@ def build_optimisers(model: DA3, read_outs: ReadOuts, config: TrainConfig) -> tu
     return muon, adamw
 
 
-def trained_model(checkpoint: Path) -> DA3:
-    """Load weights of the embedded model in the shape that their run trained; UserError if they do not fit."""
-    path = find_file(checkpoint)
-    model = build_shape(trained_shape(path))
-    load_weights(model, path, KEYS, EMBEDDED_MODEL)
-    return model.eval()
-
-
-def trained_shape(path: Path) -> str:
-    """Return the name in `SHAPES` that a run left in its weight file; files of other origin have the shipped shape."""
-    shape = None
-    if path.suffix == ".safetensors":
-        with suppress(SafetensorError), safe_open(path, "pt") as file:  # `load_weights` says what is wrong with a file
-            shape = json.loads((file.metadata() or {}).get("config", "{}")).get("shape")
-    return shape if shape in SHAPES else TrainConfig().shape
-
-
 def averaged(state: State) -> DA3:
     """Return a model of its own with the averaged weights, on the CPU."""
     model = build_on_meta(partial(build, state.model.config, state.model.spec))
@@ -235,10 +210,8 @@ def save_start(weights: Path, config: TrainConfig, path: Path) -> None:
 
     Half precision, as `save_restart`, so weights that a run leaves as they are stay those of a file like ours.
     """
-    if trained_shape(find_file(weights)) != config.shape:
-        raise UserError(f"{weights}: not weights of shape '{config.shape}', which this run trains. Name another file.")
     state = new_state(config)
-    state.model.load_state_dict(trained_model(weights).state_dict())
+    load_weights(state.model, find_file(weights), KEYS, EMBEDDED_MODEL)
     with safe_open(weights, "pt") as file:
         metadata = file.metadata() or {}
     state.counters[:2] = torch.tensor([float(metadata.get(name, 0)) for name in ("step", "views")])
