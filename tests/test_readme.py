@@ -38,11 +38,11 @@ def test_program_of_the_readme_runs(photo_folder, capsys):
     names: dict = {}
     exec(compile(program, "README.md", "exec"), names)
     shown = capsys.readouterr()
-    assert "Reconstruction(4 views, 64 x 48 pixels, cameras) Adapted(scene recipe, 2 steps, loss " in shown.out
-    assert "(4, 48, 64) (4, 4, 4)" in shown.out
+    assert "Reconstruction(4 views, 96 x 72 pixels, cameras) Adapted(scene recipe, 2 steps, loss " in shown.out
+    assert "(4, 72, 96) (4, 4, 4)" in shown.out
     assert "adapting: 2/2" in shown.err
     with np.load(photo_folder / "out" / "prediction.npz") as content:
-        assert content["depth_z"].shape == (4, 48, 64)
+        assert content["depth_z"].shape == (4, 72, 96)
     assert {path.name for path in (photo_folder / "out").iterdir() if not path.name.startswith(".")} == {
         "prediction.npz", "points.ply", "scene.glb",
     }  # fmt: skip

@@ -28,7 +28,7 @@ def test_a_cut_photo_is_said_in_log_summary_and_report(freegeo, with_portrait, t
     assert f"{sentence} --mixed pad." in summary["warnings"]
     assert sentence in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     result = Reconstruction.load(tmp_path / "out")
-    assert result.image_hw == (48, 64)
+    assert result.image_hw == (72, 96)
     assert (result.offset_xy[:4] == 0).all(), "the others are whole"
 
 
@@ -40,7 +40,7 @@ def test_adaptation_with_padding_runs_and_its_points_are_of_photos(freegeo, with
     assert "cut" not in outcome.err
     result = Reconstruction.load(out)
     inside = result.inside()
-    assert result.image_hw == (64, 64)
+    assert result.image_hw == (96, 96)
     assert inside.mean((1, 2)) == pytest.approx([0.75] * 5)
     summary = json.loads((out / "reconstruction.json").read_text(encoding="utf-8"))
     assert summary["filters"]["removed"]["outside the photo"] == (~inside).sum()

@@ -156,7 +156,7 @@ def test_a_folder_without_an_adapter_is_said_before_the_photos_are_read(freegeo,
 
 # -- the embedded model on real photos
 
-EMBEDDED = "freegeo-tiny was trained on generated rooms at 64 x 48 pixels"
+EMBEDDED = "freegeo-tiny was trained on generated rooms at 96 x 72 pixels"
 
 
 def test_the_embedded_model_says_what_it_is_not_for(freegeo, photo_folder, tmp_path):

@@ -29,23 +29,23 @@ def test_a_side_is_another_prediction(freegeo, photo_folder, tiny, tmp_path):
     assert outcome.code == 2
     assert "--process-res: 78 there, none now" in outcome.sentence()
     assert "read at another size" in outcome.sentence()
-    assert freegeo(*command, "--overwrite", "--process-res", "64").code == 0
-    assert summary(tmp_path / "out")["process_res"] == 64
-    assert "already finished" in freegeo(*command).out, "64 is the default"
+    assert freegeo(*command, "--overwrite", "--process-res", "96").code == 0
+    assert summary(tmp_path / "out")["process_res"] == 96
+    assert "already finished" in freegeo(*command).out, "96 is the default"
 
 
 @pytest.mark.parametrize("command", ["run", "reconstruct", "adapt", "batch"])
 def test_sides_that_cannot_be_are_refused_before_anything(freegeo, photo_folder, tiny, tmp_path, command):
     outcome = freegeo(command, photo_folder, "-o", tmp_path / "out", *tiny, "--process-res", "600")
     assert outcome.code == 2
-    assert "--process-res 600: freegeo-tiny reads photos with a longest side of 16 to 256" in outcome.sentence()
+    assert "--process-res 600: freegeo-tiny reads photos with a longest side of 24 to 384" in outcome.sentence()
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
 def test_a_side_far_from_the_model_s_is_a_warning_of_the_result(freegeo, photo_folder, tiny, tmp_path):
-    assert freegeo("reconstruct", photo_folder, "-o", tmp_path, *tiny, *LITTLE, "--process-res", "128").code == 0
-    assert any("128 is far from that: compare with" in sentence for sentence in summary(tmp_path)["warnings"])
+    assert freegeo("reconstruct", photo_folder, "-o", tmp_path, *tiny, *LITTLE, "--process-res", "160").code == 0
+    assert any("160 is far from that: compare with" in sentence for sentence in summary(tmp_path)["warnings"])
 
 
 @pytest.mark.slow
@@ -54,7 +54,7 @@ def test_an_adapter_is_used_at_its_side_or_doubted(freegeo, photo_folder, tiny, 
     assert made.code == 0, made.err
     assert json.loads((tmp_path / "adapter" / "freegeo.json").read_text())["process_res"] == 80
     options = ["--adapter", tmp_path / "adapter", *tiny[2:], *LITTLE]
-    words = "the adapter was trained on images of 80 pixels and is used on 64"
+    words = "the adapter was trained on images of 80 pixels and is used on 96"
     assert freegeo("reconstruct", photo_folder, "-o", tmp_path / "a", *options).code == 0
     assert any(words in sentence for sentence in summary(tmp_path / "a")["warnings"])
     assert freegeo("reconstruct", photo_folder, "-o", tmp_path / "b", *options, "--process-res", "80").code == 0

@@ -27,9 +27,9 @@ from freegeo.lock import LOCK_FILE
 ADAPTER_FILES = {"adapter_config.json", "adapter_model.safetensors", "camera_token.safetensors", "freegeo.json"}
 RESULT_FILES = {"reconstruction.json", "prediction.npz", "kept.npz", "points.ply", "scene.glb"}
 ARRAYS = {
-    "depth_z": (PHOTOS, 48, 64),
-    "conf": (PHOTOS, 48, 64),
-    "images": (PHOTOS, 48, 64, 3),
+    "depth_z": (PHOTOS, 72, 96),
+    "conf": (PHOTOS, 72, 96),
+    "images": (PHOTOS, 72, 96, 3),
     "T_cam_world": (PHOTOS, 4, 4),
     "K": (PHOTOS, 3, 3),
     "names": (PHOTOS,),
@@ -195,7 +195,7 @@ def test_other_formats_and_filters_are_written_without_adapting_again(freegeo, c
     assert {"points.ply", "scene.glb", "depth/0.png", "report.html"} <= files(copy)
     outcome = freegeo(*command, "--drop-share", 0, "--no-flying", "--no-multi-view")
     assert outcome.code == 0, outcome.err
-    assert points(copy) == PHOTOS * 48 * 64 > few
+    assert points(copy) == PHOTOS * 72 * 96 > few
     assert (copy / "depth" / "0.png").is_file()
     assert same(prediction(copy), before)
     assert (copy / "adapter" / "adapter_model.safetensors").stat().st_mtime_ns == adapter
@@ -219,8 +219,8 @@ def test_masks_that_changed_in_place_are_other_masks(freegeo, copy, photo_folder
     assert "already finished" not in outcome.out
     assert points(copy) < with_30
     with np.load(copy / "kept.npz") as kept, np.load(copy / "frozen" / "kept.npz") as frozen:
-        assert not kept["keep"][:, 10:].any()
-        assert not frozen["keep"][:, 10:].any()
+        assert not kept["keep"][:, 15:].any()
+        assert not frozen["keep"][:, 15:].any()
         assert f"{100 * kept['keep'].mean():.1f} % of" in (copy / "report.html").read_text()
 
 
@@ -328,7 +328,7 @@ def test_files_and_patterns_are_sources_too(freegeo, photo_folder, tiny, tmp_pat
 
 def test_one_photo_is_enough_to_reconstruct(freegeo, photo_folder, tiny, tmp_path):
     assert freegeo("reconstruct", photo_folder / "1.png", "-o", tmp_path / "out", *tiny).code == 0
-    assert prediction(tmp_path / "out")["depth_z"].shape == (1, 48, 64)
+    assert prediction(tmp_path / "out")["depth_z"].shape == (1, 72, 96)
 
 
 # -- adapt, and reconstruct with its adapter

@@ -87,7 +87,7 @@ def for_each(make: Callable[[str], T]) -> list[T]:
 def warn_of_embedded_model() -> None:
     """Warn that the embedded model is not for real photos."""
     logger.warning(
-        "%s was trained on generated rooms at 64 x 48 pixels, for demonstrations and tests: on real photos its cameras "
+        "%s was trained on generated rooms at 96 x 72 pixels, for demonstrations and tests: on real photos its cameras "
         "are mostly wrong (AUC@30 of .03 to .12); use %s or another model of `freegeo models`.",
         EMBEDDED_MODEL, DEFAULT_MODEL,
     )  # fmt: skip
