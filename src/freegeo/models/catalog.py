@@ -88,7 +88,7 @@ def warn_of_embedded_model() -> None:
     """Warn that the embedded model is not for real photos."""
     logger.warning(
         "%s was trained on generated rooms at 96 x 72 pixels, for demonstrations and tests: on real photos its cameras "
-        "are mostly wrong (AUC@30 of .03 to .12); use %s or another model of `freegeo models`.",
+        "are mostly wrong (AUC@30 of 0 to .29); use %s or another model of `freegeo models`.",
         EMBEDDED_MODEL, DEFAULT_MODEL,
     )  # fmt: skip
 
