@@ -145,7 +145,7 @@ def main(domain: str, room: int) -> None:
     panels = [
         ("Before: the frozen model", scores(frozen), draw(Shown(frozen, scene, usual), T, focal, ceiling)),
         ("After: freegeo run", scores(refined.result), draw(Shown(refined.result, scene, usual), T, focal, ceiling)),
-        ("The room as it is", "at the model's 64 x 48 pixels", draw(truth, T, focal, ceiling)),
+        ("The room as it is", "at the model's 96 x 72 pixels", draw(truth, T, focal, ceiling)),
     ]
     whole = picture([photos[number].read() for number in SHOWN], panels)
     whole.quantize(256, kmeans=3).save(FIGURE, optimize=True)

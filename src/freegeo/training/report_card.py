@@ -53,10 +53,10 @@ class Gate:
 
 
 GATES = (
-    Gate(metric="auc30", limit=0.60, at_least=True),
-    Gate(metric="auc05", limit=0.08, at_least=True),
+    Gate(metric="auc30", limit=0.80, at_least=True),
+    Gate(metric="auc05", limit=0.30, at_least=True),
     Gate(metric="fov_deg", limit=1.5, at_least=False),
-    Gate(metric="abs_rel", limit=0.11, at_least=False),
+    Gate(metric="abs_rel", limit=0.06, at_least=False),
 )
 
 
