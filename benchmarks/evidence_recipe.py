@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from guard import ADAPTED_TO, SETS, command_line
-from text_tables import change, plain, signed, table
+from text_tables import change, in_order, plain, signed, table
 
 from freegeo import files
 from freegeo.adaptation import recipe as recipes
@@ -119,7 +119,7 @@ def report(folder: Path) -> None:
         header = ("photos", "score", "frozen", "`scene`", "`evidence`", "bundle adjustment alone")
         print(f"\n{ways}\n\n{table(header, lines)}")
     lines = []
-    for domain in sorted({room["domain"] for room in rooms}):
+    for domain in in_order(room["domain"] for room in rooms):
         group = [room for room in rooms if room["domain"] == domain]
         cells = [" / ".join(signed(gains(group, way, name, "auc15").mean()) for name in BY_DOMAIN) for way in WAYS]
         lines.append([domain, len(group), sum(room["refused"] is None for room in group), *cells])

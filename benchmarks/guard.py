@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from text_tables import change, mean_and_worst, signed, table
+from text_tables import change, in_order, mean_and_worst, signed, table
 
 from freegeo import files
 from freegeo.adaptation import recipe as recipes
@@ -207,7 +207,7 @@ def report(folder: Path) -> None:
     """Print the tables of docs/guard.md."""
     rooms = [Room(file) for file in sorted(folder.glob("*.npz"))]
     settings = GuardSettings()
-    domains = {name: [room for room in rooms if room.domain == name] for name in sorted({r.domain for r in rooms})}
+    domains = {name: [room for room in rooms if room.domain == name] for name in in_order(r.domain for r in rooms)}
     states = {room: chosen_state({c: room.measured(c) for c in CANDIDATES}, settings) for room in rooms}
 
     def gains(group: list[Room], name: str, metric: str) -> dict[str, np.ndarray]:

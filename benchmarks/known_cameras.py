@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from record import write_result
-from text_tables import interval, plain
+from text_tables import in_order, interval, plain
 from text_tables import table as text_table
 
 import freegeo
@@ -109,7 +109,7 @@ def report(rows: list[dict]) -> None:
 
 def table(rows: list[dict], kind: str) -> str:
     """Means of the frozen model alone, and changes against them, for all rooms and for each domain."""
-    domains = sorted({row["domain"] for row in rows})
+    domains = in_order(row["domain"] for row in rows)
     groups = {"all": rows} | {domain: [row for row in rows if row["domain"] == domain] for domain in domains}
     lines = []
     for views in sorted({row["views"] for row in rows}):

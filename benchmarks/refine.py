@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from record import write_result
-from text_tables import change, plain, table
+from text_tables import change, in_order, plain, table
 
 from freegeo.data.photos import load_photos
 from freegeo.data.procedural import get_domain, photograph_room
@@ -120,7 +120,7 @@ def room_table(rows: list[dict]) -> str:
     names = ("AUC@5", "AUC@15", "AUC@30", "F1 (5 %)", "abs-rel")
     lines = []
     for kind in ("after", "unjudged", "affine"):
-        for domain in dict.fromkeys(row["domain"] for row in rows):
+        for domain in in_order(row["domain"] for row in rows):
             own = [row for row in rows if row["domain"] == domain]
             cells = []
             for score in SCORES:
