@@ -11,7 +11,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from text_tables import interval, signed, table
+from text_tables import in_order, interval, table
 
 from freegeo.benchmark.paper.tables import NAMES, short_name
 from freegeo.benchmark.results import LINES_FILE, Row, choose, entries, mean, paired, read_results
@@ -19,6 +19,7 @@ from freegeo.benchmark.results import LINES_FILE, Row, choose, entries, mean, pa
 METRICS = ("auc15", "auc30", "fscore", "f1_rel5")
 FEW = 4
 """Views for which those of all eight were decoded, too."""
+PER_SCENE = "-per-scene"
 UNSEEN_SEED = 44
 """The seed whose frames adaptation never saw together."""
 
@@ -35,11 +36,11 @@ def shown(before: list[Row], after: list[Row]) -> str:
     found = paired(before, after)
     if found is None:
         return ""
-    text = f"{signed(found.mean)} [{signed(found.low)}, {signed(found.high)}]"
+    text = f"{found.mean:+.3f} [{found.low:+.3f}, {found.high:+.3f}]"
     return f"**{text}**" if found.low > 0 else text
 
 
-def lines_of(name: str, rows: list[Row]) -> list[list[str]]:
+def lines_of(rows: list[Row]) -> list[list[str]]:
     """Rows of the table, of one folder."""
     lines = []
     for dataset in dict.fromkeys(row.dataset for row in rows):
@@ -50,7 +51,7 @@ def lines_of(name: str, rows: list[Row]) -> list[list[str]]:
                 if not frozen or not adapted:
                     continue
                 rooms = len({row.scene for row in adapted})
-                label = f"{name}: {short_name(dataset)} ({rooms} rooms), {views} views, {NAMES[metric]}"
+                label = f"{short_name(dataset)} ({rooms} rooms), {views} views, {NAMES[metric]}"
                 change, gap = paired(frozen, adapted), paired(frozen, ceiling) if views == FEW else None
                 share = f"{change.mean / gap.mean:.0%}" if change and gap and gap.low > 0 else ""
                 values = [f"{mean(frozen):.3f}", f"{mean(adapted):.3f}", shown(frozen, adapted)]
@@ -61,19 +62,23 @@ def lines_of(name: str, rows: list[Row]) -> list[list[str]]:
 def report(folders: dict[str, list[Row]]) -> None:
     """Print the table of all folders, the seed that adaptation never saw, and adapters per room against one for all."""
     header = ("", "frozen", "adapted", "gain, 95 % interval", "8->4 minus 4, 95 % interval", "share of the gap")
-    print(table(header, [line for name, rows in folders.items() for line in lines_of(name, rows)]))
+    one_for_all = {name: rows for name, rows in folders.items() if not name.endswith(PER_SCENE)}
+    per_scene = {name: rows for name, rows in folders.items() if name.endswith(PER_SCENE)}
+    for title, group in (("one adapter per split", one_for_all), ("one adapter per room", per_scene)):
+        if group:
+            print(f"{title}\n\n{table(header, [line for rows in group.values() for line in lines_of(rows)])}\n")
     lines = []
     for name, rows in folders.items():
         found = [gain(rows, FEW, metric, seed=UNSEEN_SEED) for metric in METRICS]
         if any(adapted for _, adapted, _ in found) and len({row.seed for row in rows}) > 1:
             lines.append([name, *(shown(frozen, adapted) for frozen, adapted, _ in found)])
     if lines:
-        print(f"\ngain at {FEW} views, seed {UNSEEN_SEED} alone\n")
+        print(f"gain at {FEW} views, seed {UNSEEN_SEED} alone\n")
         print(table(("", *(NAMES[metric] for metric in METRICS)), lines))
     lines = []
-    for name, rows in folders.items():
-        one = folders.get(name.removesuffix("-per-scene"))
-        if name.endswith("-per-scene") and one:
+    for name, rows in per_scene.items():
+        one = folders.get(name.removesuffix(PER_SCENE))
+        if one:
             cells = []
             for metric in METRICS:
                 (base, per_room, _), (old_base, for_all, _) = gain(rows, FEW, metric), gain(one, FEW, metric)
@@ -121,11 +126,8 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--side-by-side", action="store_true")
     options = parser.parse_args()
-    # In the order in which they were made.
-    there = sorted(
-        options.folder.glob(f"*/{LINES_FILE}"), key=lambda file: (file.parent / "predictions").stat().st_ctime
-    )
-    folders = {file.parent.name: read_results(file.parent) for file in there}
+    names = in_order(file.parent.name for file in options.folder.glob(f"*/{LINES_FILE}"))
+    folders = {name: read_results(options.folder / name) for name in names}
     side_by_side(folders) if options.side_by_side else report(folders)
 
 

@@ -205,12 +205,12 @@ PARTS: dict[str, Part] = {
         steps=each("sequence_windows.py -o {out}/windows.jsonl --rooms 1 --start {}", range(3)),
         table=("sequence_windows.py", "-o", "{out}/windows.jsonl", "--rooms", "0"),
     ),
-    "sizes": Part(
-        folder="sizes",
-        pages=("photos.md#the-size-that-the-model-sees",),
+    "choices": Part(
+        folder="choices",
+        pages=("photos.md#the-size-that-the-model-sees", "embedded-model.md#model-card"),
         minutes=5,
-        steps=words("sizes.py --out {out}/sizes.json"),
-        table=("sizes.py", "--report", "--out", "{out}/sizes.json"),
+        steps=words("choices.py --rooms 24 --out {out}/choices.json"),
+        table=("choices.py", "--report", "--out", "{out}/choices.json"),
     ),
     "rays": Part(
         folder="rays",
