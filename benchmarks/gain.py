@@ -92,7 +92,7 @@ def report(folders: dict[str, list[Row]]) -> None:
     for name, rows in folders.items():
         for dataset in dict.fromkeys(row.dataset for row in choose(rows, metric="mse")):
             found = choose(rows, dataset=dataset, metric="mse", views=FEW)
-            values = [choose(found, variant=kind) for kind in ("frozen", "adapted")]
+            values = [choose(found, variant=f"features-{kind}") for kind in ("frozen", "adapted")]
             if all(values):
                 cells = [f"{mean(value):.3f}" for value in values]
                 lines.append([f"{name}: {short_name(dataset)}", *cells, interval(changes(*values))])

@@ -204,7 +204,7 @@ def whole_walk(arguments: argparse.Namespace) -> list[dict]:
     photos = written_photos(around, arguments.work / f"photos-{'alike' if arguments.alike else 'plain'}")
     rows = []
     more = ["--refine", "ba"] if arguments.refine else []
-    for size in (12, 16) if arguments.refine else (12, 16, 24):
+    for size in (12, 16):
         for overlap in (size // 2,) if arguments.refine else (size // 2, size // 4):
             for loops in (True, False):
                 name = f"{photos.name}-{size}-{overlap}-{'loops' if loops else 'no-loops'}"

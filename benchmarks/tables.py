@@ -66,30 +66,19 @@ STUDY = f"-o {{out}}/rooms --domains {' '.join(TEST)} --rooms 1 --start {{}} --s
 """One room of each domain is a command, so that what is there of a study that was stopped is even."""
 RATE = "--hold 1 --lr 4e-3"
 """Of one adapter for 60 rooms; chosen on validation rooms (part `rate`)."""
+PER_SCENE = "--recipe scene --adapt-per scene --hold 1"
 RATES = {
     "1e-3-hold-1": "--hold 1 --lr 1e-3",
     "2e-3-hold-1": "--hold 1 --lr 2e-3",
     "4e-3-hold-1": "--hold 1 --lr 4e-3",
-    "3e-3-hold-3": "--hold 3 --lr 3e-3",
 }
-BENCH = "freegeo bench run gain features --data {data}"
 
 
-def gain(folder: str, settings: str, *, sixteen: bool = True) -> tuple[Command, ...]:
-    """What adaptation gains in rooms of one domain."""
-    run = f"{BENCH} -o {{out}}/{folder} {settings}"
-    return words(f"{run} --views 4,8 --seeds 43,44,45", *[f"{run} --views 16 --seeds 43"] * sixteen)
-
-
-def gain_of_one(domain: str, *, sixteen: bool = True) -> tuple[Command, ...]:
-    """The gain of one adapter for 60 rooms."""
-    return gain(domain, f"--datasets procedural-{domain} --scenes 60 {RATE}", sixteen=sixteen)
-
-
-def gain_per_scene(domain: str, rooms: int) -> tuple[Command, ...]:
-    """The gain of an adapter for each room."""
-    per_scene = f"--datasets procedural-{domain} --scenes {rooms} --recipe scene --adapt-per scene --hold 1"
-    return gain(f"{domain}-per-scene", per_scene)
+def gain(folder: str, domain: str, rooms: int, settings: str, tables: str = "gain") -> tuple[Command, ...]:
+    """What adaptation gains in rooms of one domain: 4 and 8 views, then all 16."""
+    run = f"freegeo bench run {tables} --data {{data}} -o {{out}}/{folder} --datasets procedural-{domain}"
+    run = f"{run} --scenes {rooms} {settings}"
+    return words(f"{run} --views 4,8 --seeds 43,44,45", f"{run} --views 16 --seeds 43")
 
 
 GAIN = "results/README.md#does-adaptation-help-gain"
@@ -97,14 +86,14 @@ PARTS: dict[str, Part] = {
     "card": Part(
         folder="card",
         pages=("embedded-model.md#quality-on-rooms-never-seen-in-training", "results/README.md#where-the-gap-is"),
-        minutes=40,
+        minutes=30,
         steps=each("freegeo models score freegeo-tiny --domains {} -o {out}/{}.json", CARD),
         table=("cards.py", "{out}"),
     ),
     "cameras": Part(
         folder="cameras",
         pages=("embedded-model.md#known-cameras",),
-        minutes=25,
+        minutes=15,
         steps=words(
             "freegeo models score freegeo-tiny --cameras --domains test-id -o {out}/test-id.json",
             "freegeo models score freegeo-tiny --cameras --domains big --rooms 100 -o {out}/big.json",
@@ -115,10 +104,10 @@ PARTS: dict[str, Part] = {
     "known-cameras": Part(
         folder="known-cameras",
         pages=("scale.md#what-known-cameras-are-worth",),
-        minutes=60,
+        minutes=35,
         steps=(
             *each("known_cameras.py --domains {} --rooms 34 --steps 0 --out {out}/{}.json", KNOWN),
-            *each("known_cameras.py --domains {} --rooms 5 --first 40 --views 8 --out {out}/adapted/{}.json", KNOWN),
+            *each("known_cameras.py --domains {} --rooms 3 --first 40 --views 8 --out {out}/adapted/{}.json", KNOWN),
         ),
         table=("known_cameras.py", "--report", "{out}"),
     ),
@@ -132,28 +121,31 @@ PARTS: dict[str, Part] = {
     "gain": Part(
         folder="gain",
         pages=(GAIN, "results/gain/"),
-        minutes=70,
-        steps=(*gain_of_one("big"), *gain_of_one("sparse")),
+        minutes=60,
+        steps=tuple(step for domain in ("big", "sparse") for step in gain(domain, domain, 60, RATE, "gain features")),
         table=("gain.py", "{out}"),
     ),
     "gain-more": Part(
         folder="gain",
         pages=(GAIN, "results/gain/"),
-        minutes=65,
-        steps=(*gain_of_one("tex", sixteen=False), *gain_of_one("light")),
+        minutes=32,
+        steps=tuple(step for domain in ("tex", "light") for step in gain(domain, domain, 40, RATE)),
         table=("gain.py", "{out}"),
     ),
     "gain-per-scene": Part(
         folder="gain",
         pages=("results/README.md#one-adapter-per-scene", "results/gain/"),
-        minutes=80,
-        steps=(*gain_per_scene("sparse", 30), *gain_per_scene("big", 24)),
+        minutes=42,
+        steps=(
+            *gain("sparse-per-scene", "sparse", 16, PER_SCENE),
+            *gain("big-per-scene", "big", 12, PER_SCENE),
+        ),
         table=("gain.py", "{out}"),
     ),
     "refine": Part(
         folder="refine",
         pages=("refinement.md#measured",),
-        minutes=40,
+        minutes=20,
         steps=(
             *each("refine.py rooms --domains {} --rooms 40 --out {out}/8/{}.json", TEST),
             *each("refine.py rooms --domains {} --rooms 16 --views 16 --out {out}/16/{}.json", TEST),
@@ -163,14 +155,14 @@ PARTS: dict[str, Part] = {
     "evidence-recipe": Part(
         folder="evidence-recipe",
         pages=("guard.md#learning-from-the-matches",),
-        minutes=80,
-        steps=each(f"evidence_recipe.py record {STUDY}", range(4)),
+        minutes=45,
+        steps=each(f"evidence_recipe.py record {STUDY}", range(3)),
         table=("evidence_recipe.py", "report", "{out}/rooms"),
     ),
     "sequences": Part(
         folder="sequences",
         pages=("sequences.md#measured", "figures/sequence-memory.png"),
-        minutes=60,
+        minutes=40,
         steps=words(
             "sequences.py chunks --seed 20000100 --out {out}/1-chunks.json --work {out}/work",
             "sequences.py exact --out {out}/2-exact.json --work {out}/work",
@@ -184,7 +176,7 @@ PARTS: dict[str, Part] = {
     "seams": Part(
         folder="seams",
         pages=("sequences.md#seams",),
-        minutes=10,
+        minutes=5,
         steps=words(
             "seams.py --rooms 3 --first 6 -o {out}/1-others.json",
             "seams.py --rooms 6 --first 0 -o {out}/2-limits-set-on.json",
@@ -194,15 +186,15 @@ PARTS: dict[str, Part] = {
     "order": Part(
         folder="order",
         pages=("sequences.md#order", "sequences.md#loops"),
-        minutes=15,
+        minutes=5,
         steps=words("sequence.py --out {out}/sequence.json"),
         table=("sequence.py", "--report", "--out", "{out}/sequence.json"),
     ),
     "windows": Part(
         folder="windows",
         pages=("sequences.md#adaptation",),
-        minutes=40,
-        steps=each("sequence_windows.py -o {out}/windows.jsonl --rooms 1 --start {}", range(3)),
+        minutes=24,
+        steps=each("sequence_windows.py -o {out}/windows.jsonl --rooms 1 --start {}", range(2)),
         table=("sequence_windows.py", "-o", "{out}/windows.jsonl", "--rooms", "0"),
     ),
     "choices": Part(
@@ -215,35 +207,35 @@ PARTS: dict[str, Part] = {
     "rays": Part(
         folder="rays",
         pages=("models/da3.md#cameras-from-rays",),
-        minutes=10,
+        minutes=5,
         steps=words("rays.py --out {out}/rays.json"),
         table=("rays.py", "--report", "--out", "{out}/rays.json"),
     ),
     "two-heads": Part(
         folder="two-heads",
         pages=("guard.md#what-it-does-not-do",),
-        minutes=30,
+        minutes=12,
         steps=each(
             "two_heads.py record -o {out}/rooms --domains test-id tex big sparse --rooms 1 --start {} --seed 44",
-            range(4),
+            range(2),
         ),
         table=("two_heads.py", "report", "{out}/rooms"),
     ),
     "quick": Part(
         folder="quick",
         pages=("results/README.md#every-experiment-once-small-quick", "results/quick/"),
-        minutes=45,
+        minutes=25,
         steps=words("freegeo bench run all --quick --data {data} -o {out}/bench"),
         table=("gain.py", "{out}"),
     ),
     "rate": Part(
         folder="rate",
         pages=("results/README.md#what---hold-is-worth-third-version",),
-        minutes=50,
+        minutes=21,
         steps=words(
             *(
-                f"{BENCH} {settings} --datasets procedural-val-big,procedural-val-sparse --scenes 16 --views 4,8"
-                f" --seeds 43 -o {{out}}/{name}"
+                f"freegeo bench run gain --data {{data}} -o {{out}}/{name} {settings} --scenes 16 --views 4,8"
+                " --seeds 43 --datasets procedural-val-big,procedural-val-sparse"
                 for name, settings in RATES.items()
             )
         ),
