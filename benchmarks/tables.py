@@ -9,8 +9,8 @@ the pages have; its first line says how many of the commands it rests on. The sa
 was: a command that was finished is not repeated, and one that was not continues by itself where it can (its own
 docstring says so). Parts of different folders may run at the same time.
 
-A folder of results belongs to one weight file, whose SHA-256 is in FOLDER.json: what was made with other weights is
-refused, never mixed in or removed. --minutes: no command begins after so long.
+A folder of results belongs to one weight file, whose SHA-256 is in FOLDER.json, and to the commands of this file: what
+was made with other weights or by a command that has changed since is refused, never mixed in or removed.
 """
 
 from __future__ import annotations
@@ -277,13 +277,20 @@ def finished(folder: Path) -> dict[str, float]:
     return json.loads(note.read_text(encoding="utf-8"))["seconds"] if note.is_file() else {}
 
 
-def why_refused(folder: Path, weights: str) -> str | None:
-    """Why a folder's results must not be used with these weights, or None."""
+def steps_of(folder: str, parts: Mapping[str, Part]) -> list[str]:
+    """The words of all steps whose results lie in a folder."""
+    return [" ".join(step) for part in parts.values() if part.folder == folder for step in part.steps]
+
+
+def why_refused(folder: Path, weights: str, steps: Sequence[str]) -> str | None:
+    """Why a folder's results must not be used with these weights and steps, or None."""
     note = note_of(folder)
     if note.is_file():
         other = json.loads(note.read_text(encoding="utf-8"))["weights"]
         if other != weights:
             return f"{folder}: made with other weights (SHA-256 {other[:12]}, the package has {weights[:12]})"
+        if strange := sorted(set(finished(folder)) - set(steps)):
+            return f"{folder}: made by a command that is none of its part any more: {strange[0]}"
     elif folder.is_dir() and any(folder.iterdir()):
         return f"{folder}: nothing says which weights it was made with"
     return None
@@ -303,9 +310,12 @@ def keep(folder: Path, weights: str, seconds: Mapping[str, float]) -> None:
 
 
 def listing(parts: Mapping[str, Part]) -> str:
-    """The parts, the pages that they feed, and what they cost."""
+    """The parts, what they cost, the file with their table, and the pages that it feeds."""
     width = max(map(len, parts))
-    lines = [f"{name:{width}}  {part.minutes:4.0f} min  {', '.join(part.pages)}" for name, part in parts.items()]
+    lines = [
+        f"{name:{width}}  {part.minutes:4.0f} min  {part.folder}.md: {', '.join(part.pages)}"
+        for name, part in parts.items()
+    ]
     total = sum(part.minutes for part in parts.values())
     return "\n".join([*lines, f"{'all':{width}}  {total:4.0f} min on one core"])
 
@@ -326,7 +336,8 @@ def main(arguments: Sequence[str] | None = None, parts: Mapping[str, Part] = PAR
         return 0
     out, fingerprint = options.output.resolve(), hash_of(weights)
     folders = dict.fromkeys(part.folder for part in chosen.values())
-    if refused := list(filter(None, (why_refused(out / folder, fingerprint) for folder in folders))):
+    reasons = (why_refused(out / folder, fingerprint, steps_of(folder, parts)) for folder in folders)
+    if refused := list(filter(None, reasons)):
         advice = "Remove folder and .json file, or choose another place with -o."
         print(*refused, advice, sep="\n", file=sys.stderr)
         return 2
@@ -367,7 +378,7 @@ def run(step: Command, out: Path, part: Part) -> int:
 
 def write_table(out: Path, part: Part, parts: Mapping[str, Part], weights: str) -> bool:
     """Write the table of what is finished; returns whether it could be made."""
-    steps = [" ".join(step) for one in parts.values() if one.folder == part.folder for step in one.steps]
+    steps = steps_of(part.folder, parts)
     there = sum(step in finished(out / part.folder) for step in steps)
     (out / f"{part.folder}.md").unlink(missing_ok=True)
     made = subprocess.run(

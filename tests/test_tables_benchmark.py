@@ -95,6 +95,16 @@ def test_a_folder_of_unknown_weights_is_refused(study, capsys):
     assert "nothing says which weights" in capsys.readouterr().err
 
 
+def test_results_of_a_command_that_has_changed_since_are_refused(study, capsys):
+    call, part, _ = study
+    assert call() == 0
+    shorter = dataclasses.replace(part, steps=part.steps[1:])
+    assert call(parts={"lines": shorter}) == 2
+    assert "made by a command that is none of its part any more" in capsys.readouterr().err
+    longer = dataclasses.replace(part, steps=(*part.steps, part.steps[0]))
+    assert call(parts={"lines": longer}) == 0
+
+
 def test_a_command_during_which_the_weights_changed_counts_for_nothing(study, capsys):
     call, _, folder = study
     (folder / "swap-2").touch()
