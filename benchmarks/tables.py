@@ -204,6 +204,13 @@ PARTS: dict[str, Part] = {
         steps=words("choices.py --rooms 24 --out {out}/choices.json"),
         table=("choices.py", "--report", "--out", "{out}/choices.json"),
     ),
+    "features": Part(
+        folder="features",
+        pages=("embedded-model.md#facts-for-adaptation",),
+        minutes=2,
+        steps=words("features.py --out {out}/features.json"),
+        table=("features.py", "--report", "--out", "{out}/features.json"),
+    ),
     "rays": Part(
         folder="rays",
         pages=("models/da3.md#cameras-from-rays",),
