@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from guard import ADAPTED_TO, SETS, command_line
+from text_tables import change, in_order, plain, signed, table
 
 from freegeo import files
 from freegeo.adaptation import recipe as recipes
@@ -27,7 +28,6 @@ from freegeo.data.procedural import get_domain, photograph_room
 from freegeo.errors import NoEvidenceError
 from freegeo.evidence.matches import find_matches
 from freegeo.evidence.refinement import bring_depth, refine
-from freegeo.metrics.bootstrap import paired_interval
 from freegeo.metrics.scene import evaluate
 from freegeo.models.catalog import load_model
 from freegeo.models.precision import Compute
@@ -91,34 +91,53 @@ def scored(found: list, scene, sets: list[list[int]]) -> list[float]:
     return [float(np.mean([row[metric] for row in rows])) for metric in METRICS]
 
 
+PHOTOS = {
+    "seen-4": "4 of the photos",
+    "seen-8": "8 of the photos",
+    "seen-12": "all 12",
+    "unseen-4": "4 never seen",
+    "half-8": "8, of which 4 never seen",
+    "all-16": "16, of which 4 never seen",
+}
+SHOWN = {"auc15": "AUC@15", "auc30": "AUC@30", "f1_rel5": "F1 (5 %)"}
+BY_DOMAIN = ("seen-4", "seen-8", "unseen-4", "half-8")
+
+
 def report(folder: Path) -> None:
-    """Print the tables of docs/guard.md."""
+    """Print the tables of docs/guard.md, "Learning from the matches"."""
     rooms = [files.read_json(file) for file in sorted(folder.glob("*.json"))]
-    domains = sorted({room["domain"] for room in rooms})
-    groups = {domain: [room for room in rooms if room["domain"] == domain] for domain in domains}
     taught = [room for room in rooms if room["refused"] is None]
-    for domain, group in {**groups, "all": rooms, "all with cameras to learn": taught}.items():
-        with_cameras = sum(room["refused"] is None for room in group)
-        refined = [sum(name == "seen-12" for name, _ in room["bundle_refused"]) == 0 for room in group]
-        print(
-            f"\n{domain}: {len(group)} rooms, {with_cameras} with cameras to learn, {sum(refined)} refined as a whole"
-        )
-        for name in SCORED:
-            for metric in ("auc15", "auc30", "f1_rel5"):
-                print(
-                    f"  {name:9s} {metric:8s}", "  ".join(cell(group, way, name, metric) for way in ("frozen", *WAYS))
-                )
+    whole = sum(all(name != "seen-12" for name, _ in room["bundle_refused"]) for room in rooms)
+    print(f"{len(rooms)} rooms, {len(taught)} with cameras to learn, bundle adjustment of all 12 accepted in {whole}")
+    for ways, group in (("all rooms", rooms), ("rooms with cameras to learn", taught)):
+        lines = []
+        for name, photos in PHOTOS.items() if group else ():
+            for row, (metric, score) in enumerate(SHOWN.items()):
+                frozen = plain(float(np.mean([scored_as(room, "frozen", name, metric) for room in group])))
+                cells = [change(gains(group, way, name, metric)) for way in WAYS]
+                lines.append(["" if row else photos, score, frozen, *cells])
+        header = ("photos", "score", "frozen", "`scene`", "`evidence`", "bundle adjustment alone")
+        print(f"\n{ways}\n\n{table(header, lines)}")
+    lines = []
+    for domain in in_order(room["domain"] for room in rooms):
+        group = [room for room in rooms if room["domain"] == domain]
+        cells = [" / ".join(signed(gains(group, way, name, "auc15").mean()) for name in BY_DOMAIN) for way in WAYS]
+        lines.append([domain, len(group), sum(room["refused"] is None for room in group), *cells])
+    header = ("rooms", "", "with cameras to learn", "`scene`", "`evidence`", "bundle adjustment alone")
+    print(f"\nAUC@15 at {' / '.join(PHOTOS[name] for name in BY_DOMAIN)}\n\n{table(header, lines)}")
+    for way in ("frozen and bundle", "scene", "evidence"):
+        seconds = [room["seconds"][way] for room in rooms if way in room["seconds"]]
+        print(f"CPU seconds, {way}: {np.mean(seconds):.0f}" if seconds else f"{way}: none")
 
 
-def cell(rooms: list[dict], way: str, name: str, metric: str) -> str:
-    """Mean of the frozen score, or mean change against it with its interval and the worst room."""
-    column = METRICS.index(metric)
-    values = np.array([[room["scores"][w][name][column] for w in (way, "frozen")] for room in rooms])
-    if way == "frozen":
-        return f"frozen {values[:, 0].mean():.3f}"
-    change = values[:, 0] - values[:, 1]
-    mean, low, high = paired_interval(change)
-    return f"{way} {mean:+.3f} [{low:+.3f}, {high:+.3f}] worst {change.min():+.3f}"
+def scored_as(room: dict, way: str, name: str, metric: str) -> float:
+    """The recorded score."""
+    return room["scores"][way][name][METRICS.index(metric)]
+
+
+def gains(rooms: list[dict], way: str, name: str, metric: str) -> np.ndarray:
+    """Change of a score against the frozen model, for each room."""
+    return np.array([scored_as(room, way, name, metric) - scored_as(room, "frozen", name, metric) for room in rooms])
 
 
 if __name__ == "__main__":

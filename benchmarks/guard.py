@@ -5,18 +5,20 @@
 
 `record` adapts the embedded model to frames 0 to 11 of each room (256 x 192 photos), predicts sets of frames with
 states of the adapter, and writes one file a room; rooms that have a file are skipped, so it can be stopped and started
-again. `report` prints the tables of docs/guard.md from these files. One thread; a room takes about half a minute.
+again. `report` prints the tables of docs/guard.md from these files. One thread; a room takes about a minute and a half.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
+from text_tables import change, in_order, mean_and_worst, signed, table
 
 from freegeo import files
 from freegeo.adaptation import recipe as recipes
@@ -39,7 +41,6 @@ from freegeo.evidence.matches import find_matches
 from freegeo.evidence.refinement import bring_depth, refine
 from freegeo.evidence.scores import PairScores, two_view
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.metrics.bootstrap import paired_interval
 from freegeo.metrics.scene import evaluate
 from freegeo.models.catalog import load_model
 from freegeo.models.precision import Compute
@@ -191,45 +192,69 @@ def _key(candidate: tuple[float, float]) -> str:
     return f"{candidate[0]:g}-{candidate[1]:g}"
 
 
+PHOTOS = {
+    "seen-4": "4 of those adapted to",
+    "seen-8": "8 of those adapted to",
+    "seen-12": "all 12 of them, what the guard judges",
+    "unseen-4": "4 that adaptation never saw",
+    "all-16": "16, four of them never seen",
+}
+SHOWN = {"auc15": "AUC@15", "auc30": "AUC@30", "f1_rel5": "F1 (5 %)"}
+BY_DOMAIN = (("auc15", "seen-4"), ("auc15", JUDGED), ("f1_rel5", JUDGED), ("auc30", "all-16"), ("f1_rel5", "all-16"))
+
+
 def report(folder: Path) -> None:
     """Print the tables of docs/guard.md."""
     rooms = [Room(file) for file in sorted(folder.glob("*.npz"))]
     settings = GuardSettings()
-    groups = {domain: [room for room in rooms if room.domain == domain] for domain in sorted({r.domain for r in rooms})}
-    for domain, group in {**groups, "all": rooms}.items():
-        verdicts = [room.verdict(settings) for room in group]
-        chosen = [chosen_state({c: room.measured(c) for c in CANDIDATES}, settings) for room in group]
-        said = [sum(v.outcome == outcome for v in verdicts) for outcome in ("adapted", "frozen", "unknown")]
-        print(f"\n{domain}: {len(group)} rooms; verdict adapted {said[0]}, frozen {said[1]}, unknown {said[2]}")
-        for name in SETS:
-            for metric in ("auc15", "auc30", "f1_rel5"):
-                always = np.array([room.gain((1.0, 1.0), name, metric) for room in group])
-                guarded = np.array([room.gain(state, name, metric) for room, state in zip(group, chosen, strict=True)])
-                oracle = np.array([max(room.gain(c, name, metric) for c in CANDIDATES) for room in group])
-                print(
-                    f"  {name:9s} {metric:8s} always {_summary(always)}  guard {_summary(guarded)}"
-                    f"  oracle {oracle.mean():+.3f}{_interval(guarded)}{_refined(group, name, metric)}"
-                )
+    domains = {name: [room for room in rooms if room.domain == name] for name in in_order(r.domain for r in rooms)}
+    states = {room: chosen_state({c: room.measured(c) for c in CANDIDATES}, settings) for room in rooms}
+
+    def gains(group: list[Room], name: str, metric: str) -> dict[str, np.ndarray]:
+        return {
+            "always": np.array([room.gain((1.0, 1.0), name, metric) for room in group]),
+            "guard": np.array([room.gain(states[room], name, metric) for room in group]),
+            "best": np.array([max(room.gain(c, name, metric) for c in CANDIDATES) for room in group]),
+        }
+
+    for domain, group in {**domains, "all": rooms}.items():
+        said = Counter(room.verdict(settings).outcome for room in group)
+        told = (f"{outcome} {said[outcome]}" for outcome in ("adapted", "frozen", "unknown"))
+        print(f"{domain}: {len(group)} rooms, {', '.join(told)}")
+    lines = []
+    for name, photos in PHOTOS.items():
+        for row, (metric, score) in enumerate(SHOWN.items()):
+            found = gains(rooms, name, metric)
+            cells = [mean_and_worst(found["always"]), change(found["guard"]), signed(found["best"].mean())]
+            lines.append(["" if row else photos, score, *cells])
+    print("\n" + table(("photos", "score", "always adapted", "guard", "best state in hindsight"), lines))
+    lines = []
+    for metric, score in SHOWN.items():
+        found = gains(rooms, JUDGED, metric)
+        refined = [change([room.refined(kind, metric) for room in rooms]) for kind in ("frozen", "guarded")]
+        lines.append([score, "0", *(mean_and_worst(found[kind]) for kind in ("always", "guard")), *refined])
+    print("\n" + table(("score", "frozen", "always adapted", "guard", "refined, frozen", "refined, guard"), lines))
+    lines, means = [], []
+    for domain, group in domains.items():
+        cells = []
+        for metric, name in BY_DOMAIN:
+            found = gains(group, name, metric)
+            cells.append(f"{signed(found['guard'].mean())} / {signed(found['always'].mean())}")
+        lines.append([domain, *cells])
+        judged = [gains(group, name, metric) for name in PHOTOS if name != "unseen-4" for metric in SHOWN]
+        means += [found["guard"].mean() for found in judged]
+    headings = (f"{SHOWN[metric].removesuffix(' (5 %)')}, {name.split('-')[1]} photos" for metric, name in BY_DOMAIN)
+    print("\n" + table(("rooms", *headings), lines))
+    low = sum(mean < -0.003 for mean in means)
+    print(f"\nOf {len(means)} means of the guard by domain {low} are below -.003, the least is {signed(min(means))}.")
     for score in ("s1", "s2", "s3", "s3-fixed", "s1b"):
-        print(score, " ".join(f"{name} {metric} {_rank(rooms, score, name, metric):+.2f}"
-              for name in ("seen-4", "seen-12", "all-16") for metric in ("auc30", "f1_rel5")))  # fmt: skip
-
-
-def _refined(group: list[Room], name: str, metric: str) -> str:
-    """What bundle adjustment makes of the frozen and of the guarded result, of the set that is judged."""
-    if name != JUDGED:
-        return ""
-    gains = {kind: np.array([room.refined(kind, metric) for room in group]) for kind in ("frozen", "guarded")}
-    return "".join(f"  refined {kind} {_summary(gain)}{_interval(gain)}" for kind, gain in gains.items())
-
-
-def _interval(gains: np.ndarray) -> str:
-    found = paired_interval(gains.tolist())
-    return f" [{found.low:+.3f}, {found.high:+.3f}]"
-
-
-def _summary(gains: np.ndarray) -> str:
-    return f"{gains.mean():+.3f} (worst {gains.min():+.3f})"
+        ranks = (
+            f"{name} {metric} {_rank(rooms, score, name, metric):+.2f}"
+            for name in ("seen-4", "seen-12", "all-16")
+            for metric in ("auc30", "f1_rel5")
+        )
+        print(f"rank correlation of {score}:", ", ".join(ranks))
+    print(f"seconds a room: {np.mean([room.arrays['seconds'][1] for room in rooms]):.0f}")
 
 
 def _rank(rooms: list[Room], score: str, name: str, metric: str) -> float:

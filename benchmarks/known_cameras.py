@@ -2,12 +2,14 @@
 
 Run: python benchmarks/known_cameras.py [--domains test-id,big,...] [--rooms 25] [--views 4,8] [--steps 100]
          [--checkpoint FILE] [--out FILE]
+     python benchmarks/known_cameras.py --report FOLDER
 
 For each room, the first photos of the path. `told`: the model is told the true cameras and predicts its own; `posed`:
 the same with the known cameras in place of these, and the scale that their distances give; `measured`: with depth
 brought to the points that matches measure, as `freegeo run --cameras` writes it. `after` and `after, measured`: the
 model sees the photos alone, and the known cameras are used after prediction. `--steps 0` leaves adaptation out.
-Printed: means of the frozen model, and changes against it with their intervals, paired over rooms.
+Printed: means of the frozen model, and changes against it with their intervals, paired over rooms; with --report, from
+all files of a folder.
 """
 
 import os
@@ -15,19 +17,21 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
+import json
 import logging
 from pathlib import Path
 
 import numpy as np
 import torch
 from record import write_result
+from text_tables import in_order, interval, plain
+from text_tables import table as text_table
 
 import freegeo
 from freegeo.cameras.known import KnownCamera, KnownCameras
 from freegeo.data.procedural import get_domain, photograph_room
 from freegeo.data.scene import Scene
 from freegeo.evidence.matches import Matches, find_matches
-from freegeo.metrics.bootstrap import paired_interval
 from freegeo.metrics.scene import evaluate
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.images import read_photos
@@ -85,21 +89,42 @@ def room(model: ReconstructionModel, seed: int, domain: str, views: int, steps: 
     return {"domain": domain, "seed": seed, "views": views, "scores": scores}
 
 
-def table(rows: list[dict]) -> dict[str, dict[str, list[float]]]:
-    """Return mean change against the frozen model alone, its interval, and of that model the mean."""
-    found: dict[str, dict[str, list[float]]] = {}
-    for way in rows[0]["scores"]:
-        found[way] = {}
-        for metric in SCORES:
-            values = np.array([row["scores"][way][metric] for row in rows])
-            base = np.array([row["scores"]["frozen"][metric] for row in rows])
-            interval = [values.mean()] if way == "frozen" else list(paired_interval(values - base))
-            found[way][metric] = [round(float(value), 4) for value in interval[:3]]
-    return found
+WAYS = {
+    "after": "cameras returned, scale by their distances",
+    "after, measured": "the same, depth by measured points",
+    "told": "cameras told",
+    "measured": "cameras told and returned, depth by measured points",
+}
+
+
+def report(rows: list[dict]) -> None:
+    """Print the tables of docs/scale.md."""
+    adapted = [row for row in rows if "adapted" in row["scores"]]
+    frozen = [row for row in rows if "adapted" not in row["scores"]]
+    if frozen:
+        print(f"frozen\n\n{table(frozen, 'frozen')}")
+    for kind in ("frozen", "adapted", "adapted with cameras") if adapted else ():
+        print(f"\n{kind}, in the rooms that were adapted to\n\n{table(adapted, kind)}")
+
+
+def table(rows: list[dict], kind: str) -> str:
+    """Means of the frozen model alone, and changes against them, for all rooms and for each domain."""
+    domains = in_order(row["domain"] for row in rows)
+    groups = {"all": rows} | {domain: [row for row in rows if row["domain"] == domain] for domain in domains}
+    lines = []
+    for views in sorted({row["views"] for row in rows}):
+        for name, members in groups.items():
+            own = [row["scores"] for row in members if row["views"] == views]
+            for metric, score in (("f1_rel5", "F1 (5 %)"), ("abs_rel", "abs-rel"), ("auc30", "AUC@30")):
+                base = np.array([found["frozen"][metric] for found in own])
+                changes = ([found[f"{kind}, {way}"][metric] for found in own] - base for way in WAYS)
+                cells = [plain(base.mean()), *map(interval, changes)]
+                lines.append([views, f"{name} ({len(own)})", score, *cells])
+    return text_table(("photos", "rooms", "", "alone", *WAYS.values()), lines)
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure, or print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--domains", default=DOMAINS)
     parser.add_argument("--rooms", type=int, default=25)
@@ -108,7 +133,12 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--checkpoint", type=Path)
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--report", type=Path, metavar="FOLDER", help="measure nothing, print what is there")
     arguments = parser.parse_args()
+    if arguments.report:
+        records = (json.loads(file.read_text(encoding="utf-8")) for file in sorted(arguments.report.rglob("*.json")))
+        report([row for record in records for row in record["results"]["rows"]])
+        return
     logging.disable(logging.WARNING)
     torch.set_num_threads(1)
     model = freegeo.load_model("freegeo-tiny", checkpoint=arguments.checkpoint)
@@ -118,16 +148,10 @@ def main() -> None:
             for views in map(int, arguments.views.split(",")):
                 rows.append(room(model, seed, domain, views, arguments.steps))
             print(domain, seed, flush=True)
-    results = {}
-    for views in sorted({row["views"] for row in rows}):
-        chosen = [row for row in rows if row["views"] == views]
-        groups = {"all": chosen} | {d: [r for r in chosen if r["domain"] == d] for d in arguments.domains.split(",")}
-        results[f"{views} views"] = {name: table(group) for name, group in groups.items()}
-        for way, values in results[f"{views} views"]["all"].items():
-            print(f"{views} views, {len(chosen)} rooms, {way:28s}", values)
+    report(rows)
     if arguments.out:
         settings = {name: str(value) for name, value in vars(arguments).items()}
-        write_result(arguments.out, settings=settings, results={"tables": results}, show=False)
+        write_result(arguments.out, settings=settings, results={"rows": rows}, show=False)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 Run: python benchmarks/refine.py rooms [--domains test-id,big,...] [--rooms 8] [--views 8] [--out FILE]
      python benchmarks/refine.py photos FOLDER... [--degrees 2] [--focal 0.02] [--out FILE]
+     python benchmarks/refine.py report FOLDER      (the tables of docs/refinement.md from all `rooms` files below it)
 
 `rooms`: frozen predictions of `freegeo-tiny`, before and after refinement (a refused refinement changes nothing), with
 the change of every score and its interval, paired over rooms (docs/embedded-model.md describes the rooms).
@@ -26,19 +27,21 @@ from pathlib import Path
 import numpy as np
 import torch
 from record import write_result
+from text_tables import change, in_order, plain, table
 
 from freegeo.data.photos import load_photos
 from freegeo.data.procedural import get_domain, photograph_room
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.matches import Matches, find_matches
-from freegeo.evidence.refinement import Refinement, bring_depth, parallax_px, refine
+from freegeo.evidence.refinement import Refinement, bring_depth, depth_misfit, parallax_px, refine
 from freegeo.evidence.tracks import join_matches, triangulate
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.geometry.depth import valid_depth
-from freegeo.metrics.bootstrap import paired_interval
 from freegeo.metrics.pose import pair_errors, pose_auc
 from freegeo.metrics.scene import evaluate
-from freegeo.types import PhotoLike
+from freegeo.models.images import read_photos
+from freegeo.pipeline import predict
+from freegeo.types import PhotoLike, Priors
 
 DOMAINS = "test-id,big,tex,sparse,light"
 SCORES = ("auc05", "auc15", "auc30", "f1_rel5", "abs_rel")
@@ -80,6 +83,7 @@ def rooms(arguments: argparse.Namespace) -> list[dict]:
                     "match_s": matched,
                     "refine_s": seconds,
                     **_told(refinement, matches),
+                    **_second(model, scene, frozen, refinement),
                 }
             )
             print(_line(rows[-1]), flush=True)
@@ -90,6 +94,16 @@ def _scores(frozen: Reconstruction, refinement: Refinement, scene, before: dict,
     if not refinement.accepted:
         return before
     return evaluate(bring_depth(frozen, refinement, affine=affine)[0], scene)
+
+
+def _second(model, scene, frozen: Reconstruction, refinement: Refinement) -> dict:
+    """F1 with the depth of a prediction that was told the refined cameras, and the misfit of both depths."""
+    if not refinement.accepted:
+        return {}
+    T_cam_world, K = (torch.from_numpy(value).double()[None] for value in (refinement.T_cam_world, refinement.K))
+    second = predict(model, read_photos(model, scene.photos), priors=Priors(T_cam_world=T_cam_world, K=K))
+    score = evaluate(bring_depth(second, refinement)[0], scene)["f1_rel5"]
+    return {"second_f1_rel5": score, "misfit": [depth_misfit(one, refinement) for one in (frozen, second)]}
 
 
 def _accepted(refinement: Refinement) -> Refinement:
@@ -115,24 +129,45 @@ def _line(row: dict) -> str:
 
 
 def room_table(rows: list[dict]) -> str:
-    """Mean before, and mean change with its interval, for each domain."""
-    lines = [
-        "| domain | rooms | accepted | " + " | ".join(SCORES) + " | s |",
-        "|---|---|---|" + "---|" * (len(SCORES) + 1),
-    ]
+    """Mean before, mean change with its interval, and the worst room, for each domain."""
+    names = ("AUC@5", "AUC@15", "AUC@30", "F1 (5 %)", "abs-rel")
+    lines = []
     for kind in ("after", "unjudged", "affine"):
-        for domain in dict.fromkeys(row["domain"] for row in rows):
+        for domain in in_order(row["domain"] for row in rows):
             own = [row for row in rows if row["domain"] == domain]
             cells = []
             for score in SCORES:
-                change = paired_interval([row[kind][score] - row["before"][score] for row in own])
-                start = np.mean([row["before"][score] for row in own])
-                cells.append(f"{start:.3f} {change.mean:+.3f} [{change.low:+.3f}, {change.high:+.3f}]")
+                start = float(np.mean([row["before"][score] for row in own]))
+                cells.append(f"{plain(start)} {change([row[kind][score] - row['before'][score] for row in own])}")
             accepted = sum(row["accepted"] for row in own)
             seconds = np.mean([row["refine_s"] for row in own])
             name = domain if kind == "after" else f"{domain} ({kind})"
-            lines.append(f"| {name} | {len(own)} | {accepted} | " + " | ".join(cells) + f" | {seconds:.1f} |")
-    return "\n".join(lines)
+            lines.append([name, f"{accepted} of {len(own)}", *cells, f"{seconds:.1f}"])
+    return table(("rooms", "accepted", *names, "CPU s"), lines)
+
+
+def report(folder: Path) -> None:
+    """Print the tables of docs/refinement.md."""
+    records = [json.loads(file.read_text(encoding="utf-8")) for file in sorted(folder.rglob("*.json"))]
+    for views in sorted({record["settings"]["views"] for record in records}):
+        rows = [row for one in records if one["settings"]["views"] == views for row in one["results"]["rows"]]
+        print(f"{views} photos; `unjudged`: whatever bundle adjustment ends with; `affine`: with `affine=True`\n")
+        print(f"{room_table(rows)}\n")
+        print(f"{second_line([row for row in rows if row['accepted']])}\n")
+
+
+def second_line(rows: list[dict]) -> str:
+    """What the second prediction, told the refined cameras, is worth in accepted rooms."""
+    if not rows:
+        return "No room was accepted."
+    first = np.array([row["after"]["f1_rel5"] for row in rows])
+    second = np.array([row["second_f1_rel5"] for row in rows])
+    taken = np.array([row["misfit"][1] < row["misfit"][0] for row in rows])
+    means = [plain(float(values.mean())) for values in (first, second, np.where(taken, second, first))]
+    return (
+        f"{len(rows)} accepted rooms, second prediction taken in {taken.sum()}: F1 (5 %) {means[0]} with the first, "
+        f"{means[1]} with the second, {means[2]} with the one that is taken"
+    )
 
 
 def photos(arguments: argparse.Namespace) -> list[dict]:
@@ -317,7 +352,11 @@ def main() -> None:
     photo.add_argument("--seeds", type=int, default=4)
     for kind in (room, photo):
         kind.add_argument("--out", type=Path)
+    kinds.add_parser("report").add_argument("folder", type=Path)
     arguments = parser.parse_args()
+    if arguments.kind == "report":
+        report(arguments.folder)
+        return
     torch.set_num_threads(1)
     rows = rooms(arguments) if arguments.kind == "rooms" else photos(arguments)
     print(room_table(rows) if arguments.kind == "rooms" else photo_table(rows))

@@ -6,20 +6,22 @@ black frames. `error` is how far a seam moves the second chunk, relative to dept
 true surfaces put it; a chunk that is bent has an error even with the best seam.
 
 Run: python benchmarks/seams.py [--rooms 6] [--first 6] [--domains val-id,val-tex,...] [-o FILE.json]
+     python benchmarks/seams.py --report FOLDER      (the tables of docs/sequences.md, from all files of a folder)
 """
 
 import argparse
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from record import write_result
+from text_tables import plain, table
 
 import freegeo
 from freegeo.data.photos import MemoryPhoto
-from freegeo.data.procedural import get_domain, photograph_room
-from freegeo.data.scene import Scene
+from freegeo.data.procedural import RenderedViews, get_domain, photograph_room, render, sample_rooms
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.geometry.depth import depth_to_world
 from freegeo.models.api import ReconstructionModel
@@ -38,7 +40,11 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=6, help="number of the first room; the limits were set on 0 to 5")
     parser.add_argument("--domains", default=DOMAINS)
     parser.add_argument("-o", "--output", type=Path, default=Path("benchmarks/results/seams.json"))
+    parser.add_argument("--report", type=Path, metavar="FOLDER", help="measure nothing, print what is there")
     arguments = parser.parse_args()
+    if arguments.report:
+        report(arguments.report)
+        return
     torch.set_num_threads(1)
     model = freegeo.load_model("freegeo-tiny")
     rows: dict[str, list[Seam]] = {name: [] for name in ("true", "reversed", "other frames", "other room", "black")}
@@ -50,7 +56,8 @@ def main() -> None:
             first, second = chunks(model, scene.photos)
             seam = align(first, second, SHARED)
             rows["true"].append(seam)
-            errors.append(error(scene, first, second, seam))
+            room = sample_rooms([seed], domain=get_domain(domain), frames=len(scene.photos))
+            errors.append(error(render(room, *first.image_hw), first, second, seam))
             rows["reversed"].append(align(first, second, [(6 + k, 3 - k) for k in range(4)]))
             rows["other frames"].append(align(first, second, [(6 + k, 6 + k) for k in range(4)]))
             if previous is not None:
@@ -65,6 +72,32 @@ def main() -> None:
     write_result(arguments.output, settings=settings, results=results)
 
 
+LABELS = {
+    "true": "the true ones",
+    "reversed": "frames in reversed order",
+    "other frames": "other frames of the room (six later)",
+    "other room": "another room",
+    "black": "black frames",
+}
+
+
+def report(folder: Path) -> None:
+    """Print the tables of docs/sequences.md, "Seams"."""
+    for file in sorted(folder.glob("*.json")):
+        record = json.loads(file.read_text(encoding="utf-8"))
+        results = record["results"]
+        rows = []
+        for name, label in LABELS.items():
+            found = results[name]
+            rows.append([label, found["seams"], found["trusted"], " / ".join(map(plain, found["inliers"].values()))])
+        print(f"{record['settings']}\n")
+        header = ("seams over four frames", "seams", "trusted", "share of inliers: least / 10 % / median / 90 % / most")
+        print(table(header, rows))
+        for name in ("errors of trusted seams", "errors of named seams"):
+            print(f"\n{name}: {results[name]}")
+        print()
+
+
 def chunks(model: ReconstructionModel, photos: tuple[PhotoLike, ...]) -> list[Reconstruction]:
     return [freegeo.reconstruct(model, [photos[i] for i in frames]) for frames in (FIRST, SECOND)]
 
@@ -74,10 +107,10 @@ def darkened(photos: tuple[PhotoLike, ...]) -> tuple[PhotoLike, ...]:
     return tuple(MemoryPhoto(p.name, black) if 6 <= i < 10 else p for i, p in enumerate(photos))
 
 
-def error(scene: Scene, first: Reconstruction, second: Reconstruction, seam: Seam) -> float:
+def error(truth: RenderedViews, first: Reconstruction, second: Reconstruction, seam: Seam) -> float:
     """Median distance between the second chunk's points by the seam and by the truth, relative to depth."""
     to_world = [
-        align(true_chunk(scene, chunk, frames), chunk, [(k, k) for k in range(len(frames))]).sim3
+        align(true_chunk(truth, chunk, frames), chunk, [(k, k) for k in range(len(frames))]).sim3
         for chunk, frames in ((first, FIRST), (second, SECOND))
     ]
     T, K = second.cameras()
@@ -87,18 +120,10 @@ def error(scene: Scene, first: Reconstruction, second: Reconstruction, seam: Sea
     return float((distance / (to_world[1].s * depth.flatten())).median())
 
 
-def true_chunk(scene: Scene, chunk: Reconstruction, frames: range) -> Reconstruction:
-    """Put the true depth and cameras of some frames in place of a chunk's prediction."""
-    height, width = chunk.image_hw
-    depth, T, K = scene.depth_z[list(frames)], scene.T_cam_world[list(frames)], scene.K[list(frames)]
-    step = depth.shape[1] // height
-    centre = step // 2  # a pixel near the middle of those that one of the model's covers
-    small = depth[:, centre::step, centre::step].numpy()
-    assert small.shape[1:] == (height, width)
-    intrinsics = K.double().numpy().copy()
-    intrinsics[:, :2, 2] -= centre
-    intrinsics[:, :2] /= step
-    return replace(chunk, depth_z=small, conf=np.ones_like(small), T_cam_world=T.numpy(), K=intrinsics)
+def true_chunk(truth: RenderedViews, chunk: Reconstruction, frames: range) -> Reconstruction:
+    """Put the true depth and cameras of some frames, rendered at the model's size, in place of a prediction."""
+    depth, T, K = (values[0, list(frames)].numpy() for values in (truth.depth_z, truth.T_cam_world, truth.K))
+    return replace(chunk, depth_z=depth, conf=np.ones_like(depth), T_cam_world=T, K=K)
 
 
 def summary(seams: list[Seam]) -> dict[str, object]:

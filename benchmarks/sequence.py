@@ -1,6 +1,7 @@
 """How well descriptors find photos of one place, how well photos are ordered by them, and which loops are verified.
 
 Run: python benchmarks/sequence.py [--rooms 4] [--domains val-id,val-big,...] [--scenes FOLDER...] [--threads 1]
+     python benchmarks/sequence.py --report --out FILE      (the tables of docs/sequences.md)
 
 Rooms are walks of 36 photos of 192 x 144 pixels. Two photos belong together when each sees 30 % of the other's surface
 (rooms) or when the pair has verified matches that fit the true cameras (each folder of --scenes holds images/ and
@@ -9,6 +10,7 @@ room, then 16 of another one or of a room with the same walls, textures and ligh
 """
 
 import argparse
+import json
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -20,6 +22,7 @@ import numpy as np
 import torch
 from record import write_result
 from scipy.stats import spearmanr
+from text_tables import plain, table
 
 from evidence import scene_views
 from freegeo.data.photos import MemoryPhoto
@@ -33,6 +36,7 @@ from freegeo.models.images import read_photos
 from freegeo.models.precision import Compute
 from freegeo.sequence.loops import loop_candidates, verified
 from freegeo.sequence.order import descriptors, similarity_order
+from freegeo.training.pool import image_size
 
 FRAMES, CLIP, PHOTO_HW, APART = 36, 16, (144, 192), 12
 TOGETHER, APART_SHARE, WRONG_PX = 0.3, 0.1, 2.0
@@ -171,7 +175,8 @@ def rounded(values: dict[str, float]) -> dict[str, float]:
 
 def times(model) -> dict[str, float]:
     """CPU seconds for 1000 frames of noise: descriptors, order and candidates."""
-    frames = torch.rand(1000, 3, 48, 64, generator=torch.Generator().manual_seed(0))
+    size = image_size(model.spec.default_side, (3, 4), model.spec.patch_size)
+    frames = torch.rand(1000, 3, *size, generator=torch.Generator().manual_seed(0))
     spent = {}
     start = time.process_time()
     found = descriptors(model, frames.split(8), Compute())
@@ -186,6 +191,26 @@ def times(model) -> dict[str, float]:
     return rounded(spent)
 
 
+def report(record: dict) -> None:
+    """Print the tables of docs/sequences.md, "Order" and "Loops"."""
+    rooms = record["results"]["rooms"]
+    scenes = {
+        name: found for name, found in record["results"].items() if name != "rooms" and "mean of kernels" in found
+    }
+    rows = []
+    for way, together in rooms["average precision, all rooms together"].items():
+        pairs = [rooms["average precision, rank correlation in one room"][way], *(s[way] for s in scenes.values())]
+        rows.append([way, plain(together, 2), *(", ".join(plain(x, 2) for x in pair) for pair in pairs)])
+    print(f"{record['settings']}\n")
+    print(table(("descriptor", "rooms together", "within a room", *scenes), rows))
+    for name in ("order: mean share of neighbours, joints below 10 %", "order: mean share of neighbours of the walk"):
+        print(f"\n{name}: {rooms[name]}")
+    print(f"\nCPU seconds of 1000 frames: {record['results']['cpu_s of 1000 frames']}\n")
+    kinds = ("right candidates", "wrong candidates", "right loops", "wrong loops")
+    loops = [[sequence, *(counts.get(kind, 0) for kind in kinds)] for sequence, counts in rooms["loops"].items()]
+    print(table(("sequence", *kinds), loops))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rooms", type=int, default=4)
@@ -193,7 +218,11 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, nargs="*", default=[])
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "sequence.json")
+    parser.add_argument("--report", action="store_true", help="measure nothing, print the tables of --out")
     options = parser.parse_args()
+    if options.report:
+        report(json.loads(options.out.read_text(encoding="utf-8")))
+        return
     torch.set_num_threads(options.threads)
     cv2.setNumThreads(options.threads)
     model = load_model("freegeo-tiny")
@@ -210,6 +239,7 @@ def main() -> None:
         settings={"rooms a domain": options.rooms, "domains": options.domains, "threads": options.threads},
         results=results,
         packages=("torch", "numpy", "scipy", "opencv-python-headless"),
+        show=False,
     )
 
 

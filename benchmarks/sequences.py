@@ -11,6 +11,7 @@ Run: python benchmarks/sequences.py PART [--frames 300] [--seed 20000000] [--ali
 `film`:   writes a walk as a video (--out FILE.mp4), by default of 1,000 frames.
 `video`:  time and peak memory of a video of 1,000 frames.
 `kill`:   a run that is killed at random moments until it ends by itself, against one that is not.
+`report`: the tables of all files in a folder (--out FOLDER).
 
 What is rendered is kept in --work, and so are finished runs: a part that is started again goes on where it stopped.
 Runs are `freegeo reconstruct` in processes of their own.
@@ -39,9 +40,11 @@ from freegeo.export.reconstruction import Reconstruction
 from freegeo.geometry.se3 import camera_centres
 from freegeo.geometry.sim3 import Sim3, align_cameras
 from freegeo.metrics.pose import pair_errors, pose_auc
+from freegeo.models.da3_config import embedded_spec
+from freegeo.training.pool import image_size
 
 DOMAIN = "test-id"
-MODEL_HW = (48, 64)
+MODEL_HW = image_size(embedded_spec().default_side, (3, 4), embedded_spec().patch_size)
 ALL_FRAMES = {"walk": 300, "memory": 300, "exact": 300, "chunks": 300, "film": 1000, "video": 1000, "kill": 300}
 KILLS = 6
 DELIVERED = (0, 3)
@@ -201,7 +204,7 @@ def whole_walk(arguments: argparse.Namespace) -> list[dict]:
     photos = written_photos(around, arguments.work / f"photos-{'alike' if arguments.alike else 'plain'}")
     rows = []
     more = ["--refine", "ba"] if arguments.refine else []
-    for size in (12, 16) if arguments.refine else (12, 16, 24):
+    for size in (12, 16):
         for overlap in (size // 2,) if arguments.refine else (size // 2, size // 4):
             for loops in (True, False):
                 name = f"{photos.name}-{size}-{overlap}-{'loops' if loops else 'no-loops'}"
@@ -363,9 +366,23 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
+HEADINGS = {
+    "size": "frames", "stride": "step", "rotation_deg": "rotation", "translation_deg": "translation", "auc30": "AUC@30",
+    "abs_rel": "abs-rel", "scale_spread": "scale", "outliers": "wrong depths", "noise": "noise of depth",
+}  # fmt: skip
+
+
+def report(folder: Path) -> None:
+    """Print the rows of every file as a table."""
+    for file in sorted(folder.glob("*.json")):
+        record = json.loads(file.read_text(encoding="utf-8"))
+        rows = [{HEADINGS.get(k, k): v for k, v in row.items()} for row in record["results"]["rows"]]
+        print(f"{file.stem}, {record['settings']}\n\n{table(rows)}\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", choices=[*PARTS, "film"])
+    parser.add_argument("part", choices=[*PARTS, "film", "report"])
     parser.add_argument("--frames", type=int, help="of the walk")
     parser.add_argument("--seed", type=int, default=20_000_000)
     parser.add_argument("--alike", action="store_true", help="walk: two rooms look alike")
@@ -373,6 +390,9 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("sequences-work"))
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
+    if arguments.part == "report":
+        report(arguments.out)
+        return
     arguments.frames = arguments.frames or ALL_FRAMES[arguments.part]
     torch.set_num_threads(1)
     if arguments.part == "film":
