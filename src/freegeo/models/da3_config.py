@@ -207,8 +207,7 @@ def embedded_spec() -> ModelSpec:
         name=EMBEDDED_MODEL,
         patch_size=EMBEDDED.patch_size,
         default_side=EMBEDDED.patch_size * EMBEDDED.position_grid,
-        # AUC@30 of 8 views, 12 rooms of `test-id`: .46 at 48 pixels, .62 at 64, .72 at 80, .76 at 96, .74 at 112, .70 at 128,
-        # .57 at 160
+        # AUC@30 of 8 views, 12 rooms of `test-id`: .46 at 48 pixels, .62 at 64, .76 at 96, .70 at 128, .57 at 160
         sides=(64, 128),
         loss_layers=EMBEDDED.out_layers,
         reference="first",
