@@ -64,7 +64,7 @@ KNOWN = ("test-id", "big", "sparse")
 TEST = ("test-id", "tex", "big", "sparse", "light")
 STUDY = f"-o {{out}}/rooms --domains {' '.join(TEST)} --rooms 1 --start {{}} --seed 44"
 """One room of each domain is a command, so that what is there of a study that was stopped is even."""
-RATE = "--hold 1 --lr 4e-3"
+RATE = "--hold 1 --lr 1e-3"
 """Of one adapter for 60 rooms; chosen on validation rooms (part `rate`)."""
 PER_SCENE = "--recipe scene --adapt-per scene --hold 1"
 RATES = {
