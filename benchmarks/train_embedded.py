@@ -1,6 +1,6 @@
 """Train the embedded model on a GPU within a time limit: `python benchmarks/train_embedded.py OUT`.
 
-One run of the preset `gpu` with compiled blocks, in a process of its own, which cools down by the end of `--seconds`.
+One run with compiled blocks, in a process of its own, which cools down by the end of `--seconds`.
 If that process dies, another goes on from its last saved state without compiled blocks. OUT receives the weights, the
 restart file for a later run (`--continue-from`), the log and the settings. Only torch, numpy and safetensors are
 imported.
@@ -20,8 +20,8 @@ from pathlib import Path
 import torch
 
 from freegeo.training import loop
-from freegeo.training.config import PRESETS, TrainConfig
-from freegeo.training.state import RESTART_FILE, new_state
+from freegeo.training.config import TrainConfig
+from freegeo.training.state import RESTART_FILE, new_state, read_state
 
 ROOMS_S, SAVING_S = 8.0, 6.0
 """What the first rooms take, and what the files of the end do."""
@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("--seconds", type=float, default=540.0, help="for everything; default %(default)s")
     parser.add_argument("--eager", action="store_true", help="without compiled blocks")
-    parser.add_argument("--views-per-step", type=int, default=PRESETS["gpu"].views_per_step)
+    parser.add_argument("--views-per-step", type=int, default=TrainConfig.views_per_step)
     parser.add_argument("--continue-from", type=Path, help=f"folder with the {RESTART_FILE} of an earlier run")
     parser.add_argument("--first-room", type=int, default=0)
     parser.add_argument("--peak", type=float, default=1.0)
@@ -66,9 +66,7 @@ def leg(given: argparse.Namespace) -> None:
     torch.backends.cuda.enable_cudnn_sdp(False)  # it plans anew, for .1 s and more, for every shape of a sample
     loop.SAVE_EVERY_S = SAVE_EVERY_S
     begun = time.monotonic()
-    config = replace(
-        PRESETS["gpu"], first_room=given.first_room, peak=given.peak, views_per_step=given.views_per_step
-    )  # fmt: skip
+    config = TrainConfig(first_room=given.first_room, peak=given.peak, views_per_step=given.views_per_step)
     if not given.eager:
         loop.compile_all(new_state(config, given.device))  # kept by PyTorch, so that the schedule can take what is left
         print(f"compiled after {time.monotonic() - begun:.1f} s", flush=True)
@@ -78,7 +76,7 @@ def leg(given: argparse.Namespace) -> None:
         minutes = (given.left - (time.monotonic() - begun) - ROOMS_S - SAVING_S) / 60
     config = replace(config, minutes=minutes)
     if given.continue_from:
-        seen = int(torch.load(given.continue_from / RESTART_FILE, weights_only=True)["counters"][1])
+        seen = read_state(given.continue_from / RESTART_FILE)["views"]
         config = replace(config, views=config.views + seen, pairs_until=0, short_until=0, small_until=0)
     loop.train(
         config, given.run, device=given.device, compile_blocks=not given.eager, continue_from=given.continue_from,

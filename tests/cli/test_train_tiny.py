@@ -1,4 +1,5 @@
 import json
+from functools import partial
 
 import pytest
 
@@ -10,10 +11,11 @@ from freegeo.training.config import TrainConfig
 @pytest.fixture
 def small_run(monkeypatch):
     """A run of ten steps on six rooms."""
-    small = TrainConfig(
-        views_per_step=4, rooms=6, rooms_per_shard=2, frames=4, warmup_views=8, depth_views=1, evaluate_every=20
-    )
-    monkeypatch.setitem(config.PRESETS, "gpu", small)
+    small = partial(
+        TrainConfig, minutes=0.0, side=64, views_per_step=4, rooms=6, rooms_per_shard=2, rooms_at_start=0, frames=4,
+        warmup_views=8, depth_views=1, evaluate_every=20,
+    )  # fmt: skip
+    monkeypatch.setattr(config, "TrainConfig", small)
     monkeypatch.setattr(loop, "LOG_EVERY_STEPS", 2)
     monkeypatch.setattr(loop, "EVALUATION_ROOMS", 2)
 

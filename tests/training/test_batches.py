@@ -92,9 +92,9 @@ def test_a_mirrored_sample_is_still_one_world(rooms):
 
 def test_phases_grow_longer_and_larger():
     config = TrainConfig()
-    phases = [config.phase(seen) for seen in (0, 30_000, 70_000, 300_000)]
+    phases = [config.phase(seen) for seen in (0, 700_000, 1_600_000, 3_700_000)]
     assert [max(phase.views) for phase in phases] == sorted(max(phase.views) for phase in phases)
-    assert [phase.side for phase in phases] == [48, 48, 48, 64]
+    assert [phase.side for phase in phases] == [72, 72, 72, 96]
 
 
 def test_rate_warms_up_stays_and_cools_down():

@@ -5,7 +5,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -25,15 +24,12 @@ KILLED_RUN = """
 import os, signal, sys
 from pathlib import Path
 from freegeo.training import loop
-from freegeo.training.config import TrainConfig
+from freegeo.training.config import LossWeights, TrainConfig
 loop.SAVE_EVERY_S = 0.0
 def progress(state):
     if state.step == 4:
         os.kill(os.getpid(), signal.SIGKILL)
-config = TrainConfig(
-    views=40, views_per_step=4, rooms=6, rooms_per_shard=2, frames=4, warmup_views=8, depth_views=1, cooldown=0.25
-)
-loop.train(config, Path(sys.argv[1]), progress=progress)
+loop.train({config}, Path(sys.argv[1]), progress=progress)
 """
 
 
@@ -63,7 +59,7 @@ def whole_run(tmp_path_factory, small_config, stopped_run):
 
 
 def test_a_stopped_run_ends_with_the_same_tensors(small_config, whole_run, stopped_run):
-    assert torch.load(stopped_run / state.NEWEST_FILE, weights_only=True)["counters"][0] == 4
+    assert torch.load(stopped_run / state.NEWEST_FILE, weights_only=True)["step"] == 4
     assert not (stopped_run / loop.WEIGHTS).exists()
     expected, found = tensors(whole_run), tensors(train(small_config, stopped_run))
     assert expected.keys() == found.keys()
@@ -73,10 +69,11 @@ def test_a_stopped_run_ends_with_the_same_tensors(small_config, whole_run, stopp
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
 def test_a_killed_run_ends_with_the_same_tensors(tmp_path, small_config, whole_run):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-    killed = subprocess.run([sys.executable, "-c", KILLED_RUN, str(tmp_path / "killed")], env=environment, check=False)
+    code = KILLED_RUN.format(config=small_config)
+    killed = subprocess.run([sys.executable, "-c", code, str(tmp_path / "killed")], env=environment, check=False)
     assert killed.returncode == -signal.SIGKILL
     saved = torch.load(tmp_path / "killed" / state.NEWEST_FILE, weights_only=True)
-    assert 0 < saved["counters"][0] <= 4
+    assert 0 < saved["step"] <= 4
     weights = train(small_config, tmp_path / "killed")
     expected, found = tensors(whole_run), tensors(weights)
     assert expected.keys() == found.keys()
@@ -87,23 +84,24 @@ def test_a_larger_budget_goes_on_from_the_plateau(tmp_path, small_config, whole_
     folder = tmp_path / "larger"
     shutil.copytree(whole_run.parent, folder)
     plateau = torch.load(folder / state.PLATEAU_FILE, weights_only=True)
-    assert 30 <= plateau["counters"][1] < 40
+    assert 30 <= plateau["views"] < 40
     steps = []
     larger = replace(small_config, views=60)
     train(larger, folder, progress=lambda now: steps.append((now.step, now.seen)))
     # The steps after the plateau are taken again, now without the cool-down, and the new budget is used up.
-    assert steps[0][0] == plateau["counters"][0] + 1
+    assert steps[0][0] == plateau["step"] + 1
     assert steps[-1][1] >= 60
 
 
 def test_a_run_continues_another_one_with_rooms_and_rates_of_its_own(tmp_path, small_config, whole_run):
-    before = torch.load(whole_run.parent / state.NEWEST_FILE, weights_only=True)["counters"].tolist()
+    saved = torch.load(whole_run.parent / state.NEWEST_FILE, weights_only=True)
+    before = saved["step"], saved["views"]
     config = replace(small_config, views=60, first_room=6, peak=0.25, cooldown=1.0)
     steps = []
     folder = tmp_path / "next"
     train(config, folder, continue_from=whole_run.parent, progress=lambda now: steps.append((now.step, now.seen)))
     assert steps[0][0] == before[0] + 1 and before[1] < steps[0][1] <= before[1] + 4 and steps[-1][1] >= 60
-    begun = replace(config, begin=(int(before[0]), int(before[1])))
+    begun = replace(config, begin=before)
     assert read_json(folder / loop.CONFIG)["begin"] == list(begun.begin)
     assert begun.rate(begun.begin[1]) == 0.0 and begun.rate(60) == 0.0
     assert 0 < max(begun.rate(seen) for seen in range(begun.begin[1], 60)) <= 0.25
@@ -115,20 +113,17 @@ def test_a_run_continues_another_one_with_rooms_and_rates_of_its_own(tmp_path, s
     assert 60 < resumed[0] <= 64 + 4
 
 
-def test_a_part_of_a_weight_file_learns_and_the_rest_stays_bit_equal(tmp_path, small_config, whole_run):
-    config = replace(small_config, views=60, learns="cam_enc.", cameras_given=1.0)
-    before, after = tensors(whole_run), tensors(train(config, tmp_path / "next", continue_from=whole_run))
+def test_a_run_continues_a_weight_file_at_its_steps_and_views(tmp_path, small_config, whole_run):
+    weights = train(replace(small_config, views=60), tmp_path / "next", continue_from=whole_run, minutes=0.0)
+    before, after = tensors(whole_run), tensors(weights)
     assert before.keys() == after.keys()
-    changed = {name for name in before if not torch.equal(before[name], after[name])}
-    assert changed and all(name.startswith("model.cam_enc.") for name in changed)
+    assert all(torch.equal(before[name], after[name]) for name in before)
     with safe_open(whole_run, "pt") as file:
         begun = [int(file.metadata()[name]) for name in ("step", "views")]
     assert read_json(tmp_path / "next" / loop.CONFIG)["begin"] == begun
 
 
 def test_mistakes_about_the_run_to_continue_are_named(tmp_path, small_config, whole_run):
-    with pytest.raises(UserError, match="needs one to start from"):
-        train(replace(small_config, learns="cam_enc."), tmp_path / "part")
     with pytest.raises(UserError, match="no run to continue"):
         train(small_config, tmp_path / "next", continue_from=tmp_path)
     with pytest.raises(UserError, match="continues no other"):
@@ -145,6 +140,13 @@ def test_settings_out_of_range_are_refused(small_config, name, value):
         replace(small_config, **{name: value})
 
 
+def test_a_state_of_an_earlier_version_is_refused(tmp_path, small_config):
+    torch.save({"model": {}, "counters": torch.zeros(4)}, tmp_path / state.RESTART_FILE)
+    with pytest.raises(UserError, match=r"restart.pt: an earlier version of freegeo wrote this state"):
+        train(small_config, tmp_path / "next", continue_from=tmp_path)
+    assert not (tmp_path / "next" / state.START_FILE).exists()
+
+
 def test_other_settings_need_another_folder(small_config, whole_run):
     with pytest.raises(UserError, match="another seed"):
         train(replace(small_config, seed=7), whole_run.parent)
@@ -157,7 +159,7 @@ def test_the_weight_file_is_a_checkpoint_of_the_embedded_model(whole_run):
     assert torch.isfinite(prediction.T_cam_world).all()
     with safe_open(whole_run, "pt") as file:
         assert int(file.metadata()["views"]) >= 40
-        assert int(file.metadata()["cpu_seconds"]) > 0
+        assert int(file.metadata()["seconds"]) >= 0
     assert whole_run.stat().st_size < 20e6
 
 
@@ -166,20 +168,6 @@ def test_a_leg_stops_in_time_and_is_resumed(tmp_path, small_config):
     train(small_config, tmp_path / "legs", minutes=0.0, progress=lambda now: seen.append(now.step))
     assert not seen
     assert (tmp_path / "legs" / state.NEWEST_FILE).is_file()
-
-
-def test_two_workers_learn_on_the_same_weights(tmp_path, small_config):
-    by_first_process = []
-    weights = train(small_config, tmp_path / "two", workers=2, progress=lambda now: by_first_process.append(now.seen))
-    saved = torch.load(tmp_path / "two" / state.NEWEST_FILE, weights_only=True)
-    assert saved["counters"][1] >= 40
-    assert all(torch.isfinite(value).all() for value in tensors(weights).values())
-    assert read_json(tmp_path / "two" / loop.CONFIG)["views"] == 40
-
-
-def test_several_workers_are_for_the_processor_only(tmp_path, small_config):
-    with pytest.raises(UserError, match="cannot train with 2 workers on cuda"):
-        train(small_config, tmp_path, workers=2, device="cuda")
 
 
 def test_a_broken_loss_stops_before_the_step_and_is_named(tmp_path, small_config, monkeypatch):
@@ -212,20 +200,46 @@ def test_a_step_that_is_not_finite_is_left_out_where_that_is_allowed(tmp_path, s
         train(config, tmp_path / "always")
 
 
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_gradients_that_are_not_finite_count_as_zero(small_config, value):
+    def weights_after(spoil):
+        now = state.new_state(small_config)
+        results = []
+        for index in range(3):
+            generator = torch.Generator().manual_seed(index)
+            for parameter in now.parameters():
+                parameter.grad = torch.randn(parameter.shape, generator=generator)
+            if index == 1:
+                spoil(now)
+            results.append(bool(loop.apply_gradients(now, 1.0, small_config)))
+        return results, [*(parameter.detach() for parameter in now.parameters()), *now.average.values()]
+
+    def break_one(now):
+        now.model.cam_dec.fc_t.weight.grad[0, 0] = float(value)
+
+    def clear_all(now):
+        for parameter in now.parameters():
+            parameter.grad.zero_()
+
+    broken, expected = weights_after(break_one), weights_after(clear_all)
+    assert broken[0] == [True, False, True] and expected[0] == [True] * 3
+    assert all(torch.equal(one, two) for one, two in zip(broken[1], expected[1], strict=True))
+
+
 def test_a_run_for_a_gpu_is_trained_within_its_time_and_started_from_half_precision(
-    tmp_path, small_config, monkeypatch
+    tmp_path, small_config, monkeypatch, caplog
 ):
     ticks = itertools.count()
-    clock = SimpleNamespace(monotonic=lambda: next(ticks) / 10, process_time=time.process_time)
+    clock = SimpleNamespace(monotonic=lambda: next(ticks) / 10)
     monkeypatch.setattr(loop, "time", clock)
     config = replace(
-        small_config, side=32, views=10**9, minutes=0.04, cameras_given=0.5, any_reference=0.5,
-        render_share=0.2, rooms_at_start=4, views_per_step=8, depth_views=2, broken_steps=1,
-        pairs_until=10**9,
+        small_config, side=32, views=10**9, minutes=0.04, render_share=0.2, rooms_at_start=4, views_per_step=8,
+        depth_views=2, broken_steps=1, pairs_until=10**9,
     )  # fmt: skip
     places = []
     weights = train(config, tmp_path / "run", progress=lambda now: places.append(loop.position(now, config)))
     assert places == sorted(places) and len(places) > 2
+    assert "of 1000000000 views, so these weights have learned little" in caplog.text
     model = load_model("freegeo-tiny", checkpoint=weights)
     assert model.config.width == 192 and weights.stat().st_size < 14.5e6
     prediction = model.decode(model.aggregate(model.embed(torch.rand(1, 3, 3, 24, 32))))
@@ -244,7 +258,7 @@ def test_a_run_for_a_gpu_is_trained_within_its_time_and_started_from_half_precis
             torch.testing.assert_close(now.model.state_dict()[name], kept, atol=2e-2, rtol=0)
 
     train(config, tmp_path / "next", continue_from=tmp_path / "run", progress=compare)
-    assert begun[0] == restart["counters"][0] + 1
+    assert begun[0] == restart["step"] + 1
 
 
 def test_global_blocks_first_look_for_tokens_like_themselves(small_config):

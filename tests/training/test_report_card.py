@@ -85,7 +85,7 @@ def test_evaluation_repeats_itself():
 
 
 def log_line(kind, views, **values):
-    return json.dumps({"kind": kind, "step": views // 10, "views": views, "cpu_s": 1.0, **values})
+    return json.dumps({"kind": kind, "step": views // 10, "views": views, "s": 1.0, **values})
 
 
 def test_learning_curve_is_drawn_and_repeated_lines_count_once(tmp_path):
@@ -93,10 +93,14 @@ def test_learning_curve_is_drawn_and_repeated_lines_count_once(tmp_path):
     names = ("auc30", "auc15", "auc05", "rotation_deg", "translation_deg", "fov_deg")
     modes = {mode: dict.fromkeys(names, 0.2) for mode in MODES}
     lines = [log_line("step", views, zero_motion=1.0, **terms) for views in (100, 200, 300, 200, 300, 400)]
-    (tmp_path / "log.jsonl").write_text("\n".join([*lines, log_line("evaluation", 400, **modes)]) + "\n")
-    assert [line["views"] for line in read_log(tmp_path / "log.jsonl")] == [100, 200, 300, 400, 400]
-    figure = plot_learning_curve(tmp_path / "log.jsonl", tmp_path / "curve.png")
-    assert matplotlib.image.imread(figure).shape[0] > 300
+    log = tmp_path / "log.jsonl"
+    log.write_text("\n".join(lines) + "\n")
+    assert [line["views"] for line in read_log(log)] == [100, 200, 300, 400]
+    without, width, _ = matplotlib.image.imread(plot_learning_curve(log, tmp_path / "losses.png")).shape
+    log.write_text("\n".join([*lines, log_line("evaluation", 400, **modes)]) + "\n")
+    with_scores, same_width, _ = matplotlib.image.imread(plot_learning_curve(log, tmp_path / "curve.png")).shape
+    # A run that was never scored has one row of panels, not a second one that is empty.
+    assert width == same_width and 1.5 * without < with_scores < 2 * without
 
 
 def test_a_missing_log_is_named(tmp_path):

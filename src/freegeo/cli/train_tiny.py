@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,10 @@ from freegeo.progress import progress_bar
 def train_tiny(
     output: Path,
     *,
-    preset: str = "gpu",
     views: int | None = None,
     minutes: float | None = None,
     budget: float | None = None,
-    workers: int = 1,
-    device: str = "cpu",
+    device: str | None = None,
     compile: bool = False,
     seed: int = 0,
     views_per_step: int | None = None,
@@ -29,51 +26,47 @@ def train_tiny(
     rooms: int | None = None,
     first_room: int | None = None,
 ) -> None:
-    """Train the embedded model; the same command continues, a larger --views goes on from the plateau.
+    """Train the embedded model on a GPU; the same command continues, a larger --views goes on from the plateau.
 
     Parameters
     ----------
     output
         Folder of the run: state, log, rendered rooms, weights.
-    preset
-        gpu, the recipe of the shipped weights; cpu, smaller photos and steps; or cameras, which trains the camera
-        encoder of given weights and nothing else.
     views
-        Views to learn from, counted with repetition; default: those of the shipped recipe.
+        Views to learn from at most, counted with repetition; default: 9 million.
     minutes
         Stop this leg after so many minutes; the state is saved.
     budget
-        Minutes that the whole schedule fits in, all legs together: the learning rate reaches zero by then.
-    workers
-        Processes that train on shared weights without locks; more than one is faster but not reproducible.
+        Minutes that the whole schedule fits in, all legs together: the learning rate reaches zero by then. 0: no limit;
+        default: 8.
     device
-        cpu or cuda, for rendering and training.
+        cpu, cuda or cuda:N, for rendering and training; default: cuda where there is one. A CPU learns from a few views
+        a second, a GPU from thousands.
     compile
         Compile the blocks of the network first; faster on a GPU after half a minute or so.
     seed
         Seed of weights and batches.
     views_per_step
-        Views that each step learns from.
+        Views that each step learns from; default: 1024.
     continue_from
         Folder of another run, or a weight file (.safetensors); this one starts where that one stands, with these
         settings and rooms.
     peak
-        Factor on all learning rates; about 0.2 for a run that continues a finished one.
+        Factor on all learning rates; default: 1, and about 0.2 suits a run that continues a finished one.
     cooldown
-        Share of the run's views in which the learning rate falls to zero.
+        Share of the run's views in which the learning rate falls to zero; default: 0.8.
     rooms
-        Rooms to learn from.
+        Rooms to learn from; default: 36 000.
     first_room
         First room of the training domain; a number beyond an earlier run's gives rooms that it has not seen.
     """
-    from freegeo.errors import UserError
+    import torch
+
     from freegeo.models.precision import choose_device
-    from freegeo.training.config import PRESETS
+    from freegeo.training.config import TrainConfig
     from freegeo.training.curve import plot_learning_curve
     from freegeo.training.loop import LOG, train
 
-    if preset not in PRESETS:
-        raise UserError(f"unknown preset '{preset}'. Choose one of {', '.join(PRESETS)}.")
     given: dict[str, Any] = {
         "seed": seed,
         "views": views,
@@ -84,11 +77,12 @@ def train_tiny(
         "rooms": rooms,
         "first_room": first_room,
     }
-    config = replace(PRESETS[preset], **{name: value for name, value in given.items() if value is not None})
+    config = TrainConfig(**{name: value for name, value in given.items() if value is not None})
+    chosen = choose_device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     with progress_bar("views", config.views) as update:
         weights = train(
-            config, output, minutes=minutes, workers=workers, device=str(choose_device(device)), compile_blocks=compile,
-            continue_from=continue_from, progress=lambda state: update(min(state.seen, config.views)),
+            config, output, minutes=minutes, device=str(chosen), compile_blocks=compile, continue_from=continue_from,
+            progress=lambda state: update(min(state.seen, config.views)),
         )  # fmt: skip
     console.say(f"weights: {weights} ({console.size(weights)})")
     console.say(f"score them: freegeo models score {EMBEDDED_MODEL} --checkpoint {weights}")

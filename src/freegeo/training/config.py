@@ -1,4 +1,4 @@
-"""Every number of a training run, and its schedule over the number of views learned from."""
+"""Every number of a training run, and its schedule over the views learned from or the time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class LossWeights:
     rotation: float = 4.0
     translation: float = 3.5
     absolute: float = 0.5
-    field_of_view: float = 1.0
+    field_of_view: float = 3.0
     rays: float = 2.0
     points: float = 2.0
     matching: float = 0.3
@@ -54,31 +54,33 @@ class Phase:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Train the embedded model on generated rooms."""
+    """Train the embedded model on generated rooms; the defaults are the recipe of the shipped weights, for one GPU.
 
-    learns: str = ""
-    """Beginning of the names of the parameters that learn, such as "cam_enc."; the others keep their values. Empty: all
-    parameters, and the maps that are only there for training."""
-    minutes: float = 0.0
-    """Time that the run's schedule fits in, all legs together; the cool-down then ends by itself. 0: no limit."""
-    views: int = 700_000
-    """Views the model learns from, counted with repetition; the last `cooldown` of them lower the learning rate."""
+    With `minutes=0` and `render_share=0` a run on the CPU repeats itself to the bit, however often it is stopped.
+    """
+
+    minutes: float = 8.0
+    """Time that the run's schedule fits in, all legs together: it goes with the time where that is further on than the
+    views are. 0: no limit."""
+    views: int = 9_000_000
+    """Views the model learns from at most, counted with repetition; an H200 learned from 3.6 million in 8 minutes."""
     begin: tuple[int, int] = (0, 0)
     """Steps and views of the run that this one continues; (0, 0): a start from nothing."""
     peak: float = 1.0
     """Factor on all learning rates; a run that continues a cooled one needs about 0.2."""
     seed: int = 0
-    side: int = 64
+    side: int = 96
     """Longest image side in pixels."""
-    views_per_step: int = 48
-    rooms: int = 7_680
+    views_per_step: int = 1_024
+    """Views of all samples of a step; with fewer, the processor that launches a GPU's work is the limit."""
+    rooms: int = 36_000
     """Rooms in the pool; they are rendered a shard at a time while training goes on."""
     rooms_per_shard: int = 96
-    rooms_at_start: int = 0
+    rooms_at_start: int = 1_152
     """Rooms to render before the first step."""
-    render_share: float = 0.0
+    render_share: float = 0.15
     """Share of the time in which new rooms are rendered. 0: a shard every 40 steps, which can be repeated exactly."""
-    field_of_view_deg: tuple[float, float] = (58.0, 72.0)
+    field_of_view_deg: tuple[float, float] = (54.0, 76.0)
     """Horizontal, one value per room."""
     first_room: int = 0
     """Rooms of the training domain to leave out, because an earlier run has learned from them."""
@@ -87,34 +89,35 @@ class TrainConfig:
     """Muon, for the matrices of the blocks and the camera decoder."""
     other_lr: float = 1e-3
     """AdamW, for the backbone's embeddings, norms and biases."""
-    head_lr: float = 4e-4
+    head_lr: float = 6e-4
     """AdamW, for the dense head and the last linear layers. Their inputs have a large mean, so that a step moves all
     outputs of a layer together: at 2e-3 rectifiers died within a few hundred steps, and the answers were constant."""
-    warmup_views: int = 6_000
-    cooldown: float = 0.85
-    ema: float = 0.99
+    warmup_views: int = 120_000
+    cooldown: float = 0.8
+    """Share of the schedule, its end, in which the learning rate falls to zero."""
+    ema: float = 0.995
+    """How much of the running average of the weights a step keeps."""
     clip: float = 1.0
-    pairs_until: int = 25_000
+    """Largest norm of all gradients together."""
+    pairs_until: int = 600_000
     """Views before windows reach beyond 2 or 3 neighbouring frames."""
-    short_until: int = 60_000
+    short_until: int = 1_500_000
     """Views before windows reach 16 views and stride 3."""
-    small_until: int = 270_000
+    small_until: int = 3_600_000
     """Views before the images reach their full size; at three quarters of it a view costs 40 % less."""
     reach: int = 10
     """Largest distance between the first and the last view of a sample, in frames, where its views are spread."""
-    any_reference: float = 0.0
+    any_reference: float = 0.6
     """Share of the samples whose reference is any of its views instead of one end of the walk."""
-    cameras_given: float = 0.0
+    cameras_given: float = 0.25
     """Share of the samples whose cameras are given to the model, which trains its camera encoder."""
-    depth_by_cameras: bool = False
-    """Compare depth in the unit of the true cameras, to which the predicted cameras bring it by their distances."""
-    depth_views: int = 8
+    depth_views: int = 128
     """Views that the dense head learns from in one step, at most one of each sample."""
     ray_branch_every: int = 8
     """Steps between two updates of the ray branch, which learns on detached features."""
-    evaluate_every: int = 25_000
-    """Views between two scores on validation rooms, which take a minute on one core. 0: none."""
-    broken_steps: int = 0
+    evaluate_every: int = 0
+    """Views between two scores on validation rooms, which are computed on one core meanwhile. 0: none."""
+    broken_steps: int = 20
     """Steps with a number that is not finite that are left out before the run ends with an error. More than 0 also
     spares a GPU from waiting for the answer after every step."""
     weights: LossWeights = LossWeights()
@@ -157,47 +160,3 @@ class TrainConfig:
     def cooldown_start(self) -> float:
         """Number of views after which the cool-down begins."""
         return self.begin[1] + (self.views - self.begin[1]) * (1 - self.cooldown)
-
-
-PRESETS = {
-    "gpu": TrainConfig(
-        views=9_000_000,
-        minutes=8.0,
-        side=96,
-        views_per_step=1_024,
-        rooms=36_000,
-        rooms_at_start=1_152,
-        render_share=0.15,
-        field_of_view_deg=(54.0, 76.0),
-        head_lr=6e-4,
-        warmup_views=120_000,
-        cooldown=0.8,
-        pairs_until=600_000,
-        short_until=1_500_000,
-        small_until=3_600_000,
-        any_reference=0.6,
-        cameras_given=0.25,
-        depth_views=128,
-        ema=0.995,
-        evaluate_every=0,
-        broken_steps=20,
-        weights=LossWeights(field_of_view=3.0),
-    ),
-    "cpu": TrainConfig(),
-    "cameras": TrainConfig(
-        learns="cam_enc.",
-        cameras_given=1.0,
-        views=1_070_000,
-        views_per_step=24,
-        peak=0.4,
-        cooldown=0.7,
-        rooms=960,
-        first_room=20_000,
-        depth_by_cameras=True,
-        depth_views=12,
-        evaluate_every=0,
-        weights=LossWeights(depth=6.0, absolute=2.0, rotation=1.0),
-    ),
-}
-"""Settings by name: those of the shipped weights on a GPU; those that earlier, smaller versions had on a CPU; and those
-of a run that goes on with the camera encoder alone."""

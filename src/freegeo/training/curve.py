@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from freegeo.errors import UserError
 from freegeo.files import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
@@ -23,7 +26,7 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 
 
 def plot_learning_curve(log: Path, figure: Path) -> Path:
-    """Draw losses, rotation error relative to zero motion, pose scores and errors over the views learned from."""
+    """Draw losses and rotation loss over the views learned from, and scores on validation rooms where there are any."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -32,30 +35,40 @@ def plot_learning_curve(log: Path, figure: Path) -> Path:
     lines = read_log(log)
     steps = [line for line in lines if line["kind"] == "step"]
     scores = [line for line in lines if line["kind"] == "evaluation"]
-    canvas, axes = pyplot.subplots(2, 2, figsize=(11, 7), sharex=True, constrained_layout=True)
-    seen = [line["views"] / 1000 for line in steps]
+    rows = 2 if scores else 1
+    canvas, axes = pyplot.subplots(
+        rows, 2, figsize=(11, 0.5 + 3.5 * rows), sharex=True, squeeze=False, constrained_layout=True
+    )
+    seen = [line["views"] / 1e6 for line in steps]
     for name in ("translation", "points", "matching", "depth", "field_of_view"):
-        # A run in which only a part of the model learns has fewer losses.
-        if all(name in line for line in steps):
-            axes[0, 0].plot(seen, [line[name] for line in steps], label=name.replace("_", " "))
-    axes[0, 0].set(title="Weighted losses (running mean)", yscale="log")
+        axes[0, 0].plot(seen, [line[name] for line in steps], label=name.replace("_", " "))
+    axes[0, 0].set(title="Weighted losses (running means)", yscale="log")
+    axes[0, 0].legend(fontsize=8)
     axes[0, 1].plot(seen, [line["rotation"] / line["zero_motion"] for line in steps], color="black")
     axes[0, 1].axhline(1, linestyle=":", color="grey")
-    axes[0, 1].set(title="Relative rotation loss / loss of standing still", ylim=(0, 1.1))
-    seen = [line["views"] / 1000 for line in scores]
-    for mode, style in (("4", "-"), ("8->4", "--")):
-        for name, colour in (("auc30", "tab:blue"), ("auc15", "tab:orange"), ("auc05", "tab:green")):
-            values = [line[mode][name] for line in scores]
-            axes[1, 0].plot(seen, values, style, color=colour, marker=".", label=f"{name}, {mode}")
-        for name, colour in (("rotation_deg", "tab:red"), ("translation_deg", "tab:purple"), ("fov_deg", "tab:brown")):
-            values = [line[mode][name] for line in scores]
-            label = f"{name.removesuffix('_deg').replace('_', ' ')}, {mode}"
-            axes[1, 1].plot(seen, values, style, color=colour, marker=".", label=label)
-    axes[1, 0].set(title="Pose AUC on validation rooms", xlabel="thousand views")
-    axes[1, 1].set(title="Median errors on validation rooms, degrees", xlabel="thousand views", ylim=(0, None))
-    for axis in (axes[0, 0], axes[1, 0], axes[1, 1]):
-        axis.legend(fontsize=8)
+    axes[0, 1].set(title="Rotation loss / that of cameras that stand still", ylim=(0, 1.1))
+    if scores:
+        plot_scores(scores, *axes[1])
+    for axis in axes[-1]:
+        axis.set(xlabel="million views", xlim=(0, None))
     with atomic_path(figure) as part:
         canvas.savefig(part, dpi=110)
     pyplot.close(canvas)
     return figure
+
+
+def plot_scores(scores: list[dict[str, Any]], quality: Axes, errors: Axes) -> None:
+    """Draw pose scores and median errors on validation rooms, for 4 views and for the same ones seen with 4 others."""
+    seen = [line["views"] / 1e6 for line in scores]
+    for mode, style in (("4", "-"), ("8->4", "--")):
+        for name, colour in (("auc30", "tab:blue"), ("auc15", "tab:orange"), ("auc05", "tab:green")):
+            values = [line[mode][name] for line in scores]
+            quality.plot(seen, values, style, color=colour, marker=".", label=f"{name}, {mode}")
+        for name, colour in (("rotation_deg", "tab:red"), ("translation_deg", "tab:purple"), ("fov_deg", "tab:brown")):
+            values = [line[mode][name] for line in scores]
+            label = f"{name.removesuffix('_deg').replace('_', ' ')}, {mode}"
+            errors.plot(seen, values, style, color=colour, marker=".", label=label)
+    quality.set(title="Pose AUC on validation rooms")
+    errors.set(title="Median errors on validation rooms, degrees", ylim=(0, None))
+    for axis in (quality, errors):
+        axis.legend(fontsize=8)

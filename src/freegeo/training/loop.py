@@ -1,10 +1,9 @@
-"""The training loop: can be stopped and resumed at any moment, with one or several processes."""
+"""The training loop: can be stopped and resumed at any moment."""
 
 from __future__ import annotations
 
 import json
 import logging
-import shutil
 import time
 from collections.abc import Callable, Iterable
 from contextlib import contextmanager
@@ -18,7 +17,7 @@ from torch import nn
 from freegeo import __version__
 from freegeo.data.procedural import get_domain
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.files import as_json, atomic_path, read_json, write_json, write_tensors
+from freegeo.files import as_json, read_json, write_json, write_tensors
 from freegeo.lock import locked
 from freegeo.models.da3 import Backbone
 from freegeo.training.batches import Batch, draw_batch
@@ -35,12 +34,13 @@ from freegeo.training.state import (
     State,
     averaged,
     new_state,
+    read_state,
+    restart,
     resume,
     save,
-    save_restart,
-    save_start,
+    state_of_weights,
+    write_state,
 )
-from freegeo.training.workers import Crew
 
 logger = logging.getLogger(__name__)
 
@@ -57,23 +57,31 @@ def train(
     folder: Path,
     *,
     minutes: float | None = None,
-    workers: int = 1,
     device: str = "cpu",
     compile_blocks: bool = False,
     continue_from: Path | None = None,
     progress: Callable[[State], None] = lambda state: None,
 ) -> Path:
-    """Train until the view budget or the time limit of this leg is used up; return the weight file.
+    """Train until the schedule is complete or the time limit of this leg is used up; return the weight file.
 
-    The same call continues a stopped run: with one worker it ends with the same tensors as a run that was never
-    stopped. A larger `views` continues from the plateau before the cool-down. `workers` processes of one thread each
-    change the shared weights without locks; on another device than the CPU there is one. `compile_blocks` compiles the
-    blocks of the backbone first. `continue_from` is the folder of another run or a weight file, whose state this one
-    starts from, with settings and rooms of its own. UserError when the folder holds a run with other settings or
-    `continue_from` holds none; FreeGeoError when too many losses are not finite or a worker dies.
+    The same call continues a stopped run: on the CPU, with `minutes=0` and `render_share=0` in the settings, it ends
+    with the same tensors as a run that was never stopped. A larger `views` continues from the plateau before the
+    cool-down. Says so when the time of the schedule was over after a small part of its views.
+
+    Args:
+        config: settings; only `views` may change when a run is continued.
+        folder: state, log, rendered rooms and weights of the run.
+        minutes: time limit of this leg, which leaves the schedule as it is.
+        device: where rooms are rendered and the model learns.
+        compile_blocks: compile the blocks of the backbone first.
+        continue_from: folder of another run, or a weight file, that this run starts from, with settings and rooms of
+            its own.
+        progress: called after every step.
+
+    Raises:
+        UserError: the folder holds a run with other settings, or `continue_from` holds none.
+        FreeGeoError: too many losses or gradients are not finite.
     """
-    if workers < 1 or (workers > 1 and device != "cpu"):
-        raise UserError(f"cannot train with {workers} workers on {device}. Use one, or several on the cpu.")
     with locked(folder), one_thread(device):
         config = begin(config, folder, continue_from)
         keep_settings(config, folder)
@@ -83,21 +91,20 @@ def train(
         if compile_blocks:
             compile_all(state)
         pool = open_pool(config, state, folder, device)
+        trainer = Trainer(state, pool, config, folder)
         begun = time.monotonic()
-        with Crew(state, config, folder, workers - 1) as crew:
-            trainer = Trainer(state, pool, config, folder, crew.lock)
-            deadline = time.monotonic() + 60 * (minutes if minutes is not None else float("inf"))
-            while time.monotonic() < deadline:
-                state.counters[3] = seconds_before + time.monotonic() - begun
-                if position(state, config) >= config.views:
-                    break
-                crew.check()
-                trainer.step()
-                trainer.keep_record()
-                progress(state)
+        deadline = begun + 60 * (minutes if minutes is not None else float("inf"))
+        while time.monotonic() < deadline:
+            state.seconds = seconds_before + time.monotonic() - begun
+            if position(state, config) >= config.views:
+                warn_of_few_views(state, config)
+                break
+            trainer.step()
+            trainer.keep_record()
+            progress(state)
         trainer.log("end", trainer.read_recent())
         save(state, config, folder / NEWEST_FILE)
-        save_restart(state, folder / RESTART_FILE)
+        write_state(restart(state), folder / RESTART_FILE)
         return write_weights(state, config, folder / WEIGHTS)
 
 
@@ -116,6 +123,17 @@ def one_thread(device: str):
 def position(state: State, config: TrainConfig) -> float:
     """Return a run's place in its schedule."""
     return config.position(state.seen, state.seconds)
+
+
+def warn_of_few_views(state: State, config: TrainConfig) -> None:
+    """Say that the time of a schedule was over after less than a tenth of its views."""
+    learned, planned = state.seen - config.begin[1], config.views - config.begin[1]
+    if learned < planned / 10:
+        logger.warning(
+            "the %g minutes of the schedule were over after %d of %d views, so these weights have learned little. "
+            "Train on a GPU, or with a larger --budget in a new folder.",
+            round(config.minutes, 2), learned, planned,
+        )  # fmt: skip
 
 
 def compile_all(state: State) -> None:
@@ -137,10 +155,10 @@ def compile_all(state: State) -> None:
 
 
 class Trainer:
-    """The part of one process in a run; the first process also renders, saves, scores and logs."""
+    """One leg of a run: takes steps, renders rooms, saves, scores and logs."""
 
-    def __init__(self, state: State, pool: Pool, config: TrainConfig, folder: Path, lock):
-        self.state, self.pool, self.config, self.folder, self.lock = state, pool, config, folder, lock
+    def __init__(self, state: State, pool: Pool, config: TrainConfig, folder: Path):
+        self.state, self.pool, self.config, self.folder = state, pool, config, folder
         self.device = next(state.model.parameters()).device
         self.recent: dict[str, torch.Tensor] = {}
         """Running means on the device; reading them waits for it."""
@@ -150,16 +168,15 @@ class Trainer:
         self.rendering_s = 0.0
         self.recorded = (state.step, state.seen, position(state, config))
 
-    def step(self, *, render_new: bool = True) -> None:
+    def step(self) -> None:
         """Draw a batch and update the weights and their average."""
-        state, config, cpu_before = self.state, self.config, time.process_time()
-        with self.lock:
-            index = state.step
-            state.counters[0] += 1
+        state, config = self.state, self.config
+        index = state.step
+        state.step += 1
         if config.render_share:
             self._render_for_a_while()
         else:
-            fill(self.pool, config, index, render_new=render_new)
+            fill(self.pool, config, index)
         place = position(state, config)
         generator = torch.Generator().manual_seed(config.seed * 1_000_003 + index)
         batch = draw_batch(self.pool, config, place, generator, self.device)
@@ -171,9 +188,7 @@ class Trainer:
         loss.backward()
         self.broken += ~apply_gradients(state, config.rate(place), config)
         self._remember(terms, batch)
-        with self.lock:
-            state.counters[1] += batch.views
-            state.counters[2] += time.process_time() - cpu_before
+        state.seen += batch.views
 
     def _render_for_a_while(self) -> None:
         """Render a shard when rendering has taken less than its share of this leg's time."""
@@ -229,12 +244,7 @@ class Trainer:
     def log(self, kind: str, values: dict[str, Any]) -> None:
         """Append one line to the run's log."""
         state = self.state
-        counters = {
-            "step": state.step,
-            "views": state.seen,
-            "cpu_s": round(state.cpu_seconds, 1),
-            "s": round(state.seconds, 1),
-        }
+        counters = {"step": state.step, "views": state.seen, "s": round(state.seconds, 1)}
         with (self.folder / LOG).open("a", encoding="utf-8") as file:
             file.write(json.dumps({"kind": kind, **counters, **values}) + "\n")
 
@@ -258,10 +268,10 @@ def apply_gradients(state: State, rate: float, config: TrainConfig) -> torch.Ten
     """
     parameters = [parameter for parameter in state.parameters() if parameter.grad is not None]
     usable = nn.utils.clip_grad_norm_(parameters, config.clip).isfinite()
-    if config.broken_steps:
-        zero = torch.zeros((), device=usable.device)
-        for parameter in parameters:
-            parameter.grad = torch.where(usable, cast(torch.Tensor, parameter.grad), zero)
+    # The bits, because 0 times a number that is not finite is not 0; times 1 they stay as they are. A `where` for every
+    # gradient would be hundreds of launches.
+    bits = [cast(torch.Tensor, parameter.grad).view(torch.int32) for parameter in parameters]
+    torch._foreach_mul_(bits, usable.to(torch.int32))
     for optimiser in state.optimisers:
         for group in optimiser.param_groups:
             group["lr"] = group[PLATEAU_LR] * rate
@@ -274,11 +284,12 @@ def apply_gradients(state: State, rate: float, config: TrainConfig) -> torch.Ten
 
 def keep_settings(config: TrainConfig, folder: Path) -> None:
     """Store the settings, or refuse to go on with other ones; only the view budget may change."""
-    settings, defaults = (as_json(asdict(each)) for each in (config, TrainConfig()))
+    settings = as_json(asdict(config))
     path = folder / CONFIG
     if path.is_file():
-        before = defaults | read_json(path)  # an older run may lack a newer setting
-        different = [name for name in settings if name != "views" and before[name] != settings[name]]
+        before = read_json(path)
+        names = sorted({*settings, *before} - {"views"})
+        different = [name for name in names if settings.get(name) != before.get(name)]
         if different:
             raise UserError(f"{folder}: holds a training run with another {', '.join(different)}. Choose a new folder.")
     write_json(path, settings)
@@ -287,45 +298,45 @@ def keep_settings(config: TrainConfig, folder: Path) -> None:
 def begin(config: TrainConfig, folder: Path, continue_from: Path | None) -> TrainConfig:
     """Copy the state of the run to continue, once, and return the settings with that run's steps and views."""
     start = folder / START_FILE
-    if continue_from is not None and not start.is_file():
-        if (folder / CONFIG).is_file():
-            raise UserError(f"{folder}: holds a run that continues no other. Choose a new folder.")
-        source = next((path for name in (NEWEST_FILE, RESTART_FILE) if (path := continue_from / name).is_file()), None)
-        if continue_from.suffix == ".safetensors":
-            save_start(continue_from, config, start)
-        elif source is None:
-            source = continue_from / NEWEST_FILE
-            raise UserError(
-                f"{source}: not found, so there is no run to continue. Name the folder of a training run, or a weight "
-                "file that ends in .safetensors."
-            )
-        else:
-            with atomic_path(start) as part:
-                shutil.copyfile(source, part)
-    if not start.is_file():
-        if config.learns:
-            raise UserError(
-                f"{folder}: this run changes only a part of a model ({config.learns}*), so it needs one to start from. "
-                "Name its weight file or its run with --continue-from."
-            )
+    if start.is_file():
+        before = read_state(start)
+    elif continue_from is None:
         return config
-    steps, views, *_ = torch.load(start, weights_only=True, map_location="cpu", mmap=True)["counters"].tolist()
-    if config.views <= views:
-        raise UserError(f"{folder}: the run to continue has seen {views:.0f} views. Ask for more than that.")
-    return replace(config, begin=(int(steps), int(views)))
+    elif (folder / CONFIG).is_file():
+        raise UserError(f"{folder}: holds a run that continues no other. Choose a new folder.")
+    else:
+        before = state_to_continue(continue_from, config)
+    if config.views <= before["views"]:
+        raise UserError(f"{folder}: the run to continue has seen {before['views']} views. Ask for more than that.")
+    if not start.is_file():
+        write_state(before, start)
+    return replace(config, begin=(before["step"], before["views"]))
 
 
-def fill(pool: Pool, config: TrainConfig, step: int, *, render_new: bool) -> None:
-    """Load the shards that a step draws from, one of each aspect at least; `render_new`: render missing ones."""
+def state_to_continue(continue_from: Path, config: TrainConfig) -> dict[str, Any]:
+    """Return the newest state in the folder of a run, or one that starts with a weight file."""
+    if continue_from.suffix == ".safetensors":
+        return state_of_weights(continue_from, config)
+    for name in (NEWEST_FILE, RESTART_FILE):
+        if (continue_from / name).is_file():
+            return read_state(continue_from / name)
+    raise UserError(
+        f"{continue_from / NEWEST_FILE}: not found, so there is no run to continue. Name the folder of a training run, "
+        "or a weight file that ends in .safetensors."
+    )
+
+
+def fill(pool: Pool, config: TrainConfig, step: int) -> None:
+    """Load the shards that a step draws from, one of each aspect at least; missing ones are rendered."""
     wanted = max(len(ASPECTS), -(-config.rooms_at_start // pool.rooms_per_shard))
     if not config.render_share:
         wanted += -(-(step - config.begin[0]) // GROW_EVERY_STEPS)
-    while pool.shards < wanted and pool.grow(render_new=render_new):
+    while pool.shards < wanted and pool.grow():
         pass
 
 
 def open_pool(config: TrainConfig, state: State, folder: Path, device: str) -> Pool:
-    """Open the run's rooms with as many as the next step draws from, so that other processes find them."""
+    """Open the run's rooms with as many as the next step draws from."""
     patch = state.model.config.patch_size
     pool = Pool(
         folder / "rooms", rooms=config.rooms, rooms_per_shard=config.rooms_per_shard, frames=config.frames,
@@ -333,7 +344,7 @@ def open_pool(config: TrainConfig, state: State, folder: Path, device: str) -> P
         domain=replace(get_domain("train"), field_of_view_deg=config.field_of_view_deg),
     )  # fmt: skip
     begun = time.monotonic()
-    fill(pool, config, state.step, render_new=True)
+    fill(pool, config, state.step)
     wait_for(torch.device(device))
     logger.info("%d rooms of %d frames ready after %.1f s", pool.rooms, config.frames, time.monotonic() - begun)
     return pool
@@ -346,7 +357,7 @@ def write_weights(state: State, config: TrainConfig, path: Path) -> Path:
         "freegeo": __version__,
         "views": str(state.seen),
         "step": str(state.step),
-        "cpu_seconds": str(round(state.cpu_seconds)),
+        "seconds": str(round(state.seconds)),
         "config": json.dumps(asdict(config)),
     }
     write_tensors(path, tensors, metadata)

@@ -98,28 +98,25 @@ def objective(
     """Return all weighted terms of one step, scalars; their sum is the loss."""
     weights = config.weights
     device_type = batch.images.device.type
-    first_tokens = camera_tokens(model, batch, generator) if config.cameras_given else None
+    first_tokens = camera_tokens(model, batch, generator)
     with torch.autocast(device_type, torch.bfloat16, enabled=device_type == "cuda"):
         features = encode(model, batch.images, first_tokens)
     features = as_float32(features)
     terms = camera_terms(model, features, batch, config)
-    if not config.learns:
-        geometry = geometry_terms(read_outs, features, batch)
-        terms["rays"] = weights.rays * geometry[0]
-        terms["points"] = weights.points * geometry[1]
-        terms["cell_depth"] = weights.cell_depth * cell_depth_term(read_outs, features, batch)
-        terms["matching"] = weights.matching * matching_term(read_outs, features, batch)
-        terms["position"] = weights.position * position_term(read_outs, features, batch)
+    geometry = geometry_terms(read_outs, features, batch)
+    terms["rays"] = weights.rays * geometry[0]
+    terms["points"] = weights.points * geometry[1]
+    terms["cell_depth"] = weights.cell_depth * cell_depth_term(read_outs, features, batch)
+    terms["matching"] = weights.matching * matching_term(read_outs, features, batch)
+    terms["position"] = weights.position * position_term(read_outs, features, batch)
     samples, views = batch.images.shape[:2]
     chosen = Choice(
         samples=to_device(torch.randperm(samples, generator=generator)[: config.depth_views], batch.images.device),
         view=int(torch.randint(views, (), generator=generator)),
     )
     depth_z, conf = read_depth(model, chosen.of(features))
-    if config.depth_by_cameras:
-        depth_z = depth_z * camera_unit(model, features, batch)[chosen.samples, None, None, None]
     terms |= depth_terms(depth_z, conf, chosen.of(batch.depth_z), config)
-    if not config.learns and step % config.ray_branch_every == 0:
+    if step % config.ray_branch_every == 0:
         terms["ray_branch"] = weights.ray_branch * ray_branch_term(model, chosen.of(features), batch, chosen)
     return terms
 
@@ -176,7 +173,8 @@ def as_float32(features: Features) -> Features:
 
 def camera_terms(model: DA3, features: Features, batch: Batch, config: TrainConfig) -> dict[str, Tensor]:
     """Compare camera encodings: relative motion of all ordered pairs, motion from view 0, field of view."""
-    t, quat, fov = camera_encoding(model, features).split([3, 4, 2], dim=-1)
+    encoding = model.cam_dec(features.levels[model.config.out_layers[-1]][1][..., 0, :])
+    t, quat, fov = encoding.split([3, 4, 2], dim=-1)
     R = quat_xyzw_to_matrix(quat)
     R_true, t_true = batch.T_world_cam[..., :3, :3], batch.T_world_cam[..., :3, 3]
     R_pairs, t_pairs = relative_motion(R, t)
@@ -193,21 +191,6 @@ def camera_terms(model: DA3, features: Features, batch: Batch, config: TrainConf
         "absolute": weights.absolute * absolute,
         "field_of_view": weights.field_of_view * (fov - batch.fov_vh).abs().mean(),
     }
-
-
-def camera_encoding(model: DA3, features: Features) -> Tensor:
-    """Return the nine numbers (B, S, 9) of the predicted cameras."""
-    return model.cam_dec(features.levels[model.config.out_layers[-1]][1][..., 0, :])
-
-
-def camera_unit(model: DA3, features: Features, batch: Batch) -> Tensor:
-    """Return the factor (B,) that brings the distances of the predicted cameras to the true ones: a geometric mean."""
-    first, second = torch.triu_indices(*[batch.images.shape[1]] * 2, 1, device=batch.images.device)
-    true, predicted = (
-        (t[:, first] - t[:, second]).norm(dim=-1).clamp_min(SMALLEST_BASELINE).log().mean(1)
-        for t in (batch.T_world_cam[..., :3, 3], camera_encoding(model, features)[..., :3])
-    )
-    return (true - predicted).exp()
 
 
 def zero_motion_rotation(batch: Batch) -> Tensor:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from safetensors.torch import load_file
 from torch import Tensor
 
 from freegeo.data.procedural import get_domain, render, sample_rooms
@@ -71,7 +72,7 @@ def render_rooms(seeds, domain: str | Domain, frames: int, size: tuple[int, int]
 class Pool:
     """The training rooms of a run, one bank for each aspect; `grow` adds a shard until all rooms are there.
 
-    On the CPU shards are files, which other processes and later legs read; on another device they stay in its memory.
+    On the CPU shards are files, which later legs read; on another device they stay in its memory.
     """
 
     def __init__(
@@ -105,7 +106,7 @@ class Pool:
         """Whether every room is in memory."""
         return self.shards >= self.total_shards
 
-    def grow(self, *, render_new: bool = True) -> bool:
+    def grow(self) -> bool:
         """Add the next shard, rendering it first where needed; False when there is none."""
         index = self.shards
         path = self.folder / f"rooms-{self.side}-{index:05d}.safetensors"
@@ -113,14 +114,10 @@ class Pool:
             return False
         if torch.device(self.device).type != "cpu":
             rooms = self._render(index)
-        elif path.is_file() or render_new:
+        else:
             if not path.is_file():
                 write_tensors(path, vars(self._render(index)))
-            from safetensors.torch import load_file
-
             rooms = Rooms(**load_file(path))
-        else:
-            return False
         start = index // len(ASPECTS) * self.rooms_per_shard
         for name, kept in vars(self.banks[index % len(ASPECTS)]).items():
             kept[start : start + self.rooms_per_shard] = getattr(rooms, name)

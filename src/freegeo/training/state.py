@@ -1,4 +1,4 @@
-"""State of a training run: weights, their average, optimisers, counters; can be saved and shared by processes."""
+"""State of a training run: weights, their average, optimisers, counters; and its files."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import torch
 from safetensors import safe_open
 from torch import Tensor, nn
 
+from freegeo.errors import UserError
 from freegeo.files import atomic_path
 from freegeo.models.catalog import EMBEDDED_MODEL
 from freegeo.models.checkpoints import build_on_meta, find_file, load_weights
@@ -35,35 +36,23 @@ PLATEAU_LR = "plateau_lr"
 
 @dataclass
 class State:
-    """Everything that changes during training; after `share` several processes work on the same numbers."""
+    """Everything that changes during training."""
 
     model: DA3
     read_outs: ReadOuts
     average: dict[str, Tensor]
     optimisers: tuple[Muon, torch.optim.AdamW]
-    counters: Tensor
-    """(4,) float64: steps begun, views learned from, seconds of processor time, seconds since the run began; on the
-    CPU."""
+    step: int = 0
+    """Steps begun."""
+    seen: int = 0
+    """Views learned from."""
+    seconds: float = 0.0
+    """Time that the run has taken, all legs together."""
 
     @property
-    def step(self) -> int:
-        """Steps begun."""
-        return int(self.counters[0])
-
-    @property
-    def seen(self) -> int:
-        """Views learned from."""
-        return int(self.counters[1])
-
-    @property
-    def cpu_seconds(self) -> float:
-        """Processor time of all workers."""
-        return float(self.counters[2])
-
-    @property
-    def seconds(self) -> float:
-        """Time that the run has taken, all legs together."""
-        return float(self.counters[3])
+    def counters(self) -> dict[str, float]:
+        """Steps begun, views learned from and the time taken, as the files name them."""
+        return {"step": self.step, "views": self.seen, "seconds": self.seconds}
 
     def parameters(self) -> list[nn.Parameter]:
         """Return all parameters that learn."""
@@ -76,7 +65,7 @@ class State:
             "read_outs": self.read_outs.state_dict(),
             "average": self.average,
             "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
-            "counters": self.counters,
+            **self.counters,
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
@@ -88,22 +77,11 @@ class State:
         if "optimisers" in saved:
             for optimiser, values in zip(self.optimisers, saved["optimisers"], strict=True):
                 optimiser.load_state_dict(values)
-        self.counters[: len(saved["counters"])] = saved["counters"]
-
-    def share(self) -> None:
-        """Move all numbers to memory that other processes can write to as well."""
-        self.model.share_memory()
-        self.read_outs.share_memory()
-        for value in (self.counters, *self.average.values()):
-            value.share_memory_()
-        for optimiser in self.optimisers:
-            for values in optimiser.state.values():
-                for tensor in values.values():
-                    tensor.share_memory_()
+        self.step, self.seen, self.seconds = saved["step"], saved["views"], saved["seconds"]
 
 
 def new_state(config: TrainConfig, device: torch.device | str = "cpu") -> State:
-    """Build model, training-only read-outs and optimisers from the seed; what does not learn has no gradients."""
+    """Build model, training-only read-outs and optimisers from the seed."""
     generator = torch.Generator().manual_seed(config.seed)
     model = build_on_meta(partial(build, EMBEDDED, embedded_spec())).to_empty(device="cpu")
     reset_norms(model)
@@ -112,12 +90,10 @@ def new_state(config: TrainConfig, device: torch.device | str = "cpu") -> State:
     start_camera_decoder(model)
     read_outs = ReadOuts(model.config.channels)
     initialise(read_outs, generator)
-    for name, parameter in model.named_parameters():
-        parameter.requires_grad_(name.startswith(config.learns))
     model, read_outs = model.to(device), read_outs.to(device)
     average = {name: value.detach().clone() for name, value in model.named_parameters()}
     optimisers = build_optimisers(model, read_outs, config)
-    return State(model, read_outs, average, optimisers, torch.zeros(4, dtype=torch.float64))
+    return State(model, read_outs, average, optimisers)
 
 
 def reset_norms(model: nn.Module) -> None:
@@ -186,41 +162,52 @@ def resume(state: State, config: TrainConfig, folder: Path) -> None:
         path = folder / name
         if not path.is_file():
             continue
-        saved = torch.load(path, weights_only=True, map_location=next(state.model.parameters()).device)
+        saved = read_state(path, next(state.model.parameters()).device)
         if name == NEWEST_FILE:
-            counters = [*saved["counters"].tolist(), 0.0]  # older states have no time
-            cooling = config.position(int(counters[1]), counters[3]) > saved["cooldown_start"]
+            cooling = config.position(saved["views"], saved["seconds"]) > saved["cooldown_start"]
             if cooling and saved["cooldown_start"] < config.cooldown_start:
                 continue
         state.restore(saved)
         if name == START_FILE:
-            state.counters[3] = 0.0
+            state.seconds = 0.0
         logger.info("resumed %s at %d views", path, state.seen)
         return
 
 
+def read_state(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Return what a file of a run holds, on a device; UserError when a version before this one wrote it."""
+    saved = torch.load(path, weights_only=True, map_location=device)
+    if "step" not in saved:
+        raise UserError(f"{path}: an earlier version of freegeo wrote this state. Start a new run in another folder.")
+    return saved
+
+
 def save(state: State, config: TrainConfig, path: Path) -> None:
     """Write the whole state atomically."""
+    write_state({**state.tensors(), "cooldown_start": config.cooldown_start}, path)
+
+
+def write_state(values: dict[str, Any], path: Path) -> None:
+    """Write atomically what `read_state` reads."""
     with atomic_path(path) as part:
-        torch.save({**state.tensors(), "cooldown_start": config.cooldown_start}, part)
+        torch.save(values, part)
 
 
-def save_start(weights: Path, config: TrainConfig, path: Path) -> None:
-    """Write the state of a run that starts with the weights of a file, after the steps and views that the file names.
+def state_of_weights(weights: Path, config: TrainConfig) -> dict[str, Any]:
+    """Return the state of a run that starts with a weight file, after the steps and views that the file names.
 
-    Half precision, as `save_restart`, so weights that a run leaves as they are stay those of a file like ours.
+    The maps that are only there for training start anew: a weight file has none.
     """
     state = new_state(config)
     load_weights(state.model, find_file(weights), KEYS, EMBEDDED_MODEL)
     with safe_open(weights, "pt") as file:
         metadata = file.metadata() or {}
-    state.counters[:2] = torch.tensor([float(metadata.get(name, 0)) for name in ("step", "views")])
-    save_restart(state, path)
+    state.step, state.seen = (int(metadata.get(name, 0)) for name in ("step", "views"))
+    return restart(state)
 
 
-def save_restart(state: State, path: Path) -> None:
-    """Write the weights without average and optimisers in half precision, about a tenth of the whole state."""
+def restart(state: State) -> dict[str, Any]:
+    """Return the weights without average and optimisers in half precision, about a tenth of the whole state."""
     parts = {"model": state.model.state_dict(), "read_outs": state.read_outs.state_dict()}
     halves = {part: {name: value.half().cpu() for name, value in values.items()} for part, values in parts.items()}
-    with atomic_path(path) as temporary:
-        torch.save({**halves, "counters": state.counters}, temporary)
+    return {**halves, **state.counters}
