@@ -333,8 +333,8 @@ def test_evidence_is_the_same_on_every_device(device):
 @pytest.mark.slow
 def test_training_on_a_gpu_renders_learns_and_saves_there(tmp_path):
     config = TrainConfig(
-        views=8, views_per_step=2, rooms=3, rooms_per_shard=1, frames=3, depth_views=1, warmup_views=1, broken_steps=1,
-        evaluate_every=0,
+        minutes=0.0, views=8, views_per_step=2, rooms=3, rooms_per_shard=1, rooms_at_start=0, render_share=0.0,
+        frames=3, depth_views=1, warmup_views=1,
     )  # fmt: skip
     with pretended("cuda")() as pretend:
         waits = []

@@ -140,6 +140,13 @@ def test_settings_out_of_range_are_refused(small_config, name, value):
         replace(small_config, **{name: value})
 
 
+def test_a_step_that_the_memory_does_not_hold_is_refused(tmp_path, small_config, monkeypatch):
+    monkeypatch.setattr(loop, "host_available", lambda: 10**9)
+    with pytest.raises(UserError, match=r"1024 views takes about 47 GB .* 1.0 GB are free. Give --views-per-step 10"):
+        train(replace(small_config, side=96, views_per_step=1024), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_state_of_an_earlier_version_is_refused(tmp_path, small_config):
     torch.save({"model": {}, "counters": torch.zeros(4)}, tmp_path / state.RESTART_FILE)
     with pytest.raises(UserError, match=r"restart.pt: an earlier version of freegeo wrote this state"):
@@ -205,7 +212,7 @@ def test_gradients_that_are_not_finite_count_as_zero(small_config, value):
     def weights_after(spoil):
         now = state.new_state(small_config)
         results = []
-        for index in range(3):
+        for index in range(2):
             generator = torch.Generator().manual_seed(index)
             for parameter in now.parameters():
                 parameter.grad = torch.randn(parameter.shape, generator=generator)
@@ -222,7 +229,7 @@ def test_gradients_that_are_not_finite_count_as_zero(small_config, value):
             parameter.grad.zero_()
 
     broken, expected = weights_after(break_one), weights_after(clear_all)
-    assert broken[0] == [True, False, True] and expected[0] == [True] * 3
+    assert broken[0] == [True, False] and expected[0] == [True, True]
     assert all(torch.equal(one, two) for one, two in zip(broken[1], expected[1], strict=True))
 
 

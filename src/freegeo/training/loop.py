@@ -18,6 +18,7 @@ from freegeo import __version__
 from freegeo.data.procedural import get_domain
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import as_json, read_json, write_json, write_tensors
+from freegeo.host import host_available
 from freegeo.lock import locked
 from freegeo.models.da3 import Backbone
 from freegeo.training.batches import Batch, draw_batch
@@ -50,6 +51,9 @@ LOG_EVERY_STEPS = 100
 LOG_MEMORY = 0.98
 SAVE_EVERY_S = 120.0
 EVALUATION_ROOMS = 24
+BYTES_PER_PIXEL = 5_000
+"""Memory of a step on the CPU for every pixel of its views, if these were square (measured with 96 views of 96 pixels).
+"""
 
 
 def train(
@@ -79,9 +83,12 @@ def train(
         progress: called after every step.
 
     Raises:
-        UserError: the folder holds a run with other settings, or `continue_from` holds none.
+        UserError: the folder holds a run with other settings, `continue_from` holds none, or the memory of this machine
+            is too small for a step on the CPU.
         FreeGeoError: too many losses or gradients are not finite.
     """
+    if device == "cpu":
+        require_memory(config)
     with locked(folder), one_thread(device):
         config = begin(config, folder, continue_from)
         keep_settings(config, folder)
@@ -106,6 +113,17 @@ def train(
         save(state, config, folder / NEWEST_FILE)
         write_state(restart(state), folder / RESTART_FILE)
         return write_weights(state, config, folder / WEIGHTS)
+
+
+def require_memory(config: TrainConfig) -> None:
+    """Raise UserError when a step on the CPU takes more memory than is free; the system would end the process."""
+    view, free = BYTES_PER_PIXEL * config.side**2, host_available()
+    needed = config.views_per_step * view
+    if needed > free:
+        raise UserError(
+            f"a step of {config.views_per_step} views takes about {needed / 1e9:.0f} GB of memory on the CPU, and "
+            f"{free / 1e9:.1f} GB are free. Give --views-per-step {max(2, free // (2 * view))}, or train on a GPU."
+        )
 
 
 @contextmanager
