@@ -130,6 +130,10 @@ def test_mistakes_about_the_run_to_continue_are_named(tmp_path, small_config, wh
         train(small_config, whole_run.parent, continue_from=tmp_path)
     with pytest.raises(UserError, match="Ask for more"):
         train(replace(small_config, views=30), tmp_path / "next", continue_from=whole_run.parent)
+    (tmp_path / "damaged").mkdir()
+    (tmp_path / "damaged" / state.NEWEST_FILE).write_bytes(b"PK\3\4 cut off")
+    with pytest.raises(UserError, match="not a readable checkpoint"):
+        train(small_config, tmp_path / "damaged")
 
 
 @pytest.mark.parametrize(

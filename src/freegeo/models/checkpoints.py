@@ -194,10 +194,14 @@ def _read_part(path: Path) -> dict[str, Tensor]:
             return load_file(path)
     if path.suffix not in PICKLES:
         raise UserError(f"{path}: unknown kind of checkpoint '{path.suffix}'. Use .safetensors or .pt.")
-    return _read_pickle(path)
+    return _state_dict(read_pickle(path), path)
 
 
-def _read_pickle(path: Path) -> dict[str, Tensor]:
+def read_pickle(path: Path, device: torch.device | str = "cpu") -> Any:
+    """Return the tensors and plain values of a file of `torch.save`, on a device, without running code from it.
+
+    UserError when the file is damaged or holds anything else.
+    """
     _require_weights(path)
     with path.open("rb") as file:
         in_zip = file.read(4) == b"PK\3\4"
@@ -205,7 +209,7 @@ def _read_pickle(path: Path) -> dict[str, Tensor]:
         # A Namespace of options, which many training programs store, is plain data.
         with torch.serialization.safe_globals([argparse.Namespace]), warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # about the pickle's protocol
-            content = torch.load(path, map_location="cpu", mmap=in_zip, weights_only=True)
+            return torch.load(path, map_location=device, mmap=in_zip, weights_only=True)
     except _PICKLE_ERRORS as error:
         foreign = re.search(r"GLOBAL ([\w.]+)", str(error))
         if foreign:
@@ -214,9 +218,9 @@ def _read_pickle(path: Path) -> dict[str, Tensor]:
                 "checkpoint. Use the official .safetensors download, or save the state dict alone."
             ) from None
         raise UserError(
-            f"{path}: not a readable checkpoint; it is damaged, truncated, or of another kind. Download it again."
+            f"{path}: not a readable checkpoint; it is damaged, truncated, or of another kind. Download it again, or "
+            "remove it if a training run of yours left it."
         ) from None
-    return _state_dict(content, path)
 
 
 def _state_dict(content: Any, path: Path) -> dict[str, Tensor]:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from freegeo.errors import UserError
 from freegeo.files import atomic_path
 from freegeo.models.catalog import EMBEDDED_MODEL
-from freegeo.models.checkpoints import build_on_meta, find_file, load_weights
+from freegeo.models.checkpoints import build_on_meta, find_file, load_weights, read_pickle
 from freegeo.models.da3 import DA3, Backbone
 from freegeo.models.da3_config import EMBEDDED, KEYS, build, embedded_spec
 from freegeo.models.transformer import Block, initialise
@@ -175,8 +175,8 @@ def resume(state: State, config: TrainConfig, folder: Path) -> None:
 
 
 def read_state(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Return what a file of a run holds, on a device; UserError when a version before this one wrote it."""
-    saved = torch.load(path, weights_only=True, map_location=device)
+    """Return what a file of a run holds, on a device; UserError when it is damaged, or an earlier version wrote it."""
+    saved = read_pickle(path, device)
     if "step" not in saved:
         raise UserError(f"{path}: an earlier version of freegeo wrote this state. Start a new run in another folder.")
     return saved
