@@ -6,11 +6,14 @@ from freegeo.cli.jobs import say_known
 from freegeo.export.reconstruction import METRIC_MODEL
 from freegeo.report.answer import HEADER, LACKING, OVERLAP, answer, rescaled
 
-SCORES = {"epipolar_px": 2.0, "reprojection_px": 3.0, "scale_drift": 0.01, "depth_agreement": 0.9, "matches": 1200}
+SCORES = {
+    "epipolar_px": 2.0, "reprojection_px": 3.0, "scale_drift": 0.01, "depth_agreement": 0.9,
+    "depth_agreement_frozen": 0.9, "matches": 1200,
+}  # fmt: skip
 WHOLE = {**SCORES, "steps": 1.0, "strength": 1.0, "probability": 0.4, "gain": 0.1, "veto": None}
 HALF = {**WHOLE, "strength": 0.5, "probability": 0.95, "epipolar_px": 1.5}
 RECIPE = {"hold": 1.0, "steps": 100, "lr": 3e-5}
-NOTHING = {"matches": 0} | dict.fromkeys(("epipolar_px", "reprojection_px", "scale_drift", "depth_agreement"))
+NOTHING = {name: 0 if name == "matches" else None for name in SCORES}
 
 
 def summary(**changes):
@@ -103,6 +106,12 @@ def test_a_refined_result_is_the_one_in_use():
     assert rows(answer(summary(recipe=None, refinement=refinement(True)))) == ["frozen", "refined (used)"]
     saved = answer(summary(recipe=None, adapter="a/", refinement=refinement(True, frozen=None)))
     assert rows(saved) == ["adapted", "refined (used)"]
+
+
+def test_contradictions_are_compared_with_the_frozen_ones_on_the_same_pixels():
+    trial = {**WHOLE, "depth_agreement": 0.88, "depth_agreement_frozen": 0.885}
+    found = answer(summary(verdict=verdict("adapted", [trial], chosen=0), adapter="adapter"))
+    assert [row[HEADER.index("contradicted pixels, %")] for row in found.rows] == ["10.0", "12.0 (11.5)"]
 
 
 def test_depth_that_contradicts_itself_more_is_said():

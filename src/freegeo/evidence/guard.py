@@ -101,6 +101,7 @@ class Measurement:
             "reprojection_px": _number(self.reprojection_px),
             "scale_drift": _number(self.drift),
             "depth_agreement": _number(self.agreement),
+            "depth_agreement_frozen": _number(self.agreement_before),
             "matches": int(self.epipolar.used.sum()),
         }
 

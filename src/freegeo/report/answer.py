@@ -14,9 +14,10 @@ HEADER = ("model", "epipolar error, px", "reprojection error, px", "contradicted
 NOTE = (
     "Medians over pairs of photos, from matches that no model has a part in: how far matching points lie from their "
     "epipolar lines (cameras), and from where depth and cameras put them, in pixels of the photos as they were "
-    "matched; and the share of pixels whose depth other views contradict. Smaller is better. Sure: how certain it is, "
-    "by drawing pairs anew, that the matches fit better than before. For refined cameras the epipolar error is that of "
-    "pairs that had no part in the adjustment."
+    "matched; and the share of pixels whose depth other views contradict (in brackets: the frozen model's on the same "
+    "pixels, which are not the same for every row). Smaller is better. Sure: how certain it is, by drawing pairs anew, "
+    "that the matches fit better than before. For refined cameras the epipolar error is that of pairs that had no part "
+    "in the adjustment."
 )
 OVERLAP = (
     "Take photos that share more: neighbours that overlap by two thirds, from different places instead of turns on the "
@@ -92,13 +93,14 @@ def _refinement(summary: Mapping[str, Any]) -> Iterator[Part]:
     if told:
         more = " The cameras stay as they were predicted."
         if told["accepted"]:
-            before, after = (1 - told[key]["depth_agreement"] for key in ("before", "after"))
-            more = (
-                f" But depth maps contradict each other more, in {100 * after:.0f} % of the pixels instead of "
-                f"{100 * before:.0f} %: they are less exact than the cameras."
-                if after > before + WORSE
-                else ""
-            )
+            after, before = (told["after"].get(key) for key in ("depth_agreement", "depth_agreement_frozen"))
+            more = ""
+            if before is not None and before > after + WORSE:
+                more = (
+                    " But depth maps contradict each other more, in "
+                    f"{100 * (1 - after):.0f} % of the pixels instead of {100 * (1 - before):.0f} %: they are less exact "
+                    "than the cameras."
+                )
         outcome: Outcome = "yes" if told["accepted"] else "no"
         yield Part(what="Refinement", outcome=outcome, sentence=told["reason"] + more)
 
@@ -130,14 +132,15 @@ def _rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
 
 
 def _cells(scores: Mapping[str, float | None]) -> tuple[str, ...]:
-    agreement = scores.get("depth_agreement")
+    shares = (scores.get(key) for key in ("depth_agreement", "depth_agreement_frozen"))
+    own, frozen = (None if share is None else f"{100 * (1 - share):.1f}" for share in shares)
     probability = scores.get("probability")
     values = {
-        **scores, "contradicted": None if agreement is None else 100 * (1 - agreement),
+        **scores, "contradicted": own if frozen in (None, own) else f"{own} ({frozen})",
         "probability": None if probability is None else 100 * probability,
     }  # fmt: skip
     formats = (
-        ("epipolar_px", "{:.2f}"), ("reprojection_px", "{:.2f}"), ("contradicted", "{:.1f}"), ("matches", "{:,}"),
+        ("epipolar_px", "{:.2f}"), ("reprojection_px", "{:.2f}"), ("contradicted", "{}"), ("matches", "{:,}"),
         ("probability", "{:.0f}"),
     )  # fmt: skip
     return tuple("–" if values.get(name) is None else text.format(values[name]) for name, text in formats)
