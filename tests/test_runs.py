@@ -45,7 +45,17 @@ def test_photos_that_fit_are_predicted_at_once_as_by_reconstruct(tmp_path):
     assert torch.equal(*(torch.tensor(one.depth_z) for one in (found.result, freegeo.reconstruct(model, pictures()))))
 
 
-def test_a_recipe_and_an_adapter_at_once_are_refused(tmp_path):
-    with pytest.raises(UserError, match="Leave out one of them"):
-        freegeo.reconstruct_sequence(tiny_da3(), pictures(), tmp_path / "out", recipe="scene", adapter=tmp_path)
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"recipe": "scene", "adapter": "adapter"}, "Leave out one of them"),
+        ({"chunk": "auto"}, "chunk is a number of photos, or None"),
+        ({"chunk": 0}, "--chunk must be at least 2"),
+        ({"order": "name"}, "order is auto, given, similar"),
+        ({"refine": True, "cameras": "cameras.json"}, "Leave out refine or cameras"),
+    ],
+)
+def test_what_cannot_be_is_refused_and_nothing_is_written(tmp_path, wrong, words):
+    with pytest.raises(UserError, match=words):
+        freegeo.reconstruct_sequence(tiny_da3(), pictures(), tmp_path / "out", **wrong)
     assert not (tmp_path / "out").exists()

@@ -12,7 +12,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from freegeo.adaptation.adapt import require_unchanged_images
 from freegeo.adaptation.adapter import is_adapted
@@ -105,6 +105,14 @@ class SequenceWish:
     order: OrderRule = "auto"
     loops: bool = True
 
+    def check(self) -> None:
+        """Raise UserError for values of a caller that are no numbers of photos, or no rule."""
+        for name, value in (("chunk", self.chunk), ("overlap", self.overlap)):
+            if value is not None and (not isinstance(value, int) or isinstance(value, bool)):
+                raise UserError(f"{name} is a number of photos, or None, not {value!r}.")
+        if self.order not in get_args(OrderRule):
+            raise UserError(f"order is {', '.join(get_args(OrderRule))}, not {self.order!r}.")
+
     def plan(
         self,
         model: ReconstructionModel,
@@ -122,7 +130,7 @@ class SequenceWish:
         """
         count, image_hw = len(photos), read_some(model, photos, [0], mixed, process_res).image_hw
         _, fitting = plan_reconstruction(model, 1, image_hw, compute=compute)
-        size = self.chunk or before or min(fitting, model.spec.chunk)
+        size = (before or min(fitting, model.spec.chunk)) if self.chunk is None else self.chunk
         if min(size, count) > fitting:
             raise UserError(
                 f"--chunk {size}: at most {fitting} photos of {image_hw[1]} x {image_hw[0]} pixels fit into memory "
@@ -518,6 +526,8 @@ def reconstruct_sequence(
         raise UserError("the model carries an adapter; detach it, and give the folder of a saved one as adapter.")
     require_pose_from(model.spec, pose_from)
     require_seed(seed)
+    wish = SequenceWish(chunk=chunk, overlap=overlap, order=order, loops=loops)
+    wish.check()
     if reference is not None:
         require_rule(reference)
         if model.spec.reference == NO_REFERENCE:
@@ -545,9 +555,8 @@ def reconstruct_sequence(
             seen, known = known_cameras(seen, cameras)
         written = check_formats(formats, [photo.name for photo in seen], has_cameras=model.spec.cameras)
         found = read_inputs(
-            seen, model, plan, SequenceWish(chunk=chunk, overlap=overlap, order=order, loops=loops), compute,
-            known=known, mixed=mixed, process_res=process_res, reference=reference, scale=scale, one_camera=one_camera,
-            before=None if overwrite else together_before(folder),
+            seen, model, plan, wish, compute, known=known, mixed=mixed, process_res=process_res, reference=reference,
+            scale=scale, one_camera=one_camera, before=None if overwrite else together_before(folder),
         )  # fmt: skip
         saved = None if adapter is None else find_adapter(adapter)
         points = filters or FilterSettings()
