@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +23,9 @@ from freegeo.export.reconstruction import Reconstruction, open_reconstruction
 from freegeo.fusion.tracks import Tracks
 from freegeo.geometry.sim3 import Sim3, align_cameras
 from freegeo.refined import Refined
+from freegeo.sequence.chunks import Chunk
 from freegeo.sequence.cuts import Jumps
+from freegeo.sequence.loops import Loop
 from freegeo.sequence.order import descriptors
 from freegeo.sequence_job import Pace, SequenceJob
 from freegeo.types import ImageBatch
@@ -186,6 +189,15 @@ def test_the_time_that_is_left_is_that_of_chunks_that_were_computed():
     assert pace.left(4) == ", last one done in about 50 s"
     pace.count = 99
     assert pace.left(9) == ", last one done in about 15 min"
+
+
+def test_a_loop_is_used_where_its_prediction_fits_at_both_ends():
+    loop = Loop(first=1, second=12, similarity=0.9, matches=99, frames=(0, 1, 2, 11, 12, 13), reason=None)
+    parts = [Chunk(frames=(0, 1, 2)), Chunk(frames=(11, 12, 13)), Chunk(frames=(0, 1, 12, 13), tie="loop")]
+    fits, fails = (SimpleNamespace(first=0, second=2, reason=None), SimpleNamespace(first=1, second=2, reason="no."))
+    assert sequence_job._not_closed(SimpleNamespace(joints=[fits, fails]), loop, parts, 2)
+    fails.reason = None
+    assert sequence_job._not_closed(SimpleNamespace(joints=[fits, fails]), loop, parts, 2) is None
 
 
 def test_a_distance_across_a_cut_is_refused_before_any_prediction(freegeo, walk, tiny, tmp_path, oracle, monkeypatch):

@@ -21,7 +21,7 @@ Kind = Literal["neighbours", "bridge", "loop"]
 Load = Callable[[int], Depths]
 Seams = Mapping[tuple[int, int], Seam]
 """By the numbers of two chunks, the smaller first."""
-CONTRADICTED = "loops contradict each other or the seams between neighbours, so that none of this part is used."
+CONTRADICTED = "in this part of the sequence loops contradict each other or the seams between neighbours: none is used."
 _OPEN = 4
 """Chunks that are held in memory."""
 
