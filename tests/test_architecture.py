@@ -17,6 +17,10 @@ ALLOWED = {
         *("models", "data", "adaptation", "evidence", "export", "report", "sequence"),
         *("job", "pipeline", "guarded", "posed", "metres", "cameras"),
     },
+    "runs": {
+        *("models", "data", "adaptation", "evidence", "export", "fusion", "sequence", "progress"),
+        *("job", "sequence_job", "pipeline", "posed", "metres", "cameras"),
+    },
     "pipeline": {
         *("models", "data", "adaptation", "evidence", "export", "progress"),
         *("guarded", "taught", "posed", "metres", "cameras"),

@@ -17,8 +17,9 @@ from freegeo.export.pixels import corner_K
 from freegeo.export.reconstruction import METRIC_MODEL, Reconstruction, Scale
 from freegeo.geometry.camera import project
 from freegeo.geometry.se3 import camera_centres, transform_points
-from freegeo.metres import Gps, in_metres, local_positions, read_scale
+from freegeo.metres import Gps, in_metres, local_positions, read_scale, require_in_view
 from freegeo.posed import is_one_camera, with_one_camera
+from freegeo.types import ImageBatch
 
 FACTOR = 2.5
 
@@ -244,3 +245,22 @@ def test_photos_with_other_exif_data_are_of_other_cameras(tmp_path):
     result, about = with_one_camera(replace(scene, K=K), photos)
     assert [one["photos"] for one in about["cameras"]] == [2, 2]
     assert np.allclose(result.K[2, 0, 0], 3 * scene.K[2, 0, 0])
+
+
+def test_a_place_that_is_cut_off_for_the_model_is_refused_before_any_prediction():
+    scene = room(crop=3)
+    photos = photos_of(scene)
+    batch = ImageBatch(
+        images=torch.zeros(len(scene), 3, *scene.image_hw), names=scene.names,
+        **{name: torch.from_numpy(getattr(scene, name)) for name in ("photo_hw", "scale_xy", "offset_xy")},
+    )  # fmt: skip
+    require_in_view(read_scale(two_places(scene)[0], photos), batch, photos)
+    name = scene.names[0]
+    with pytest.raises(UserError, match=f"{name}:0,0 lies in the part of the photo that is cut off"):
+        require_in_view(read_scale(f"{name}:0,0 {name}:60,50 = 1", photos), batch, photos)
+
+
+def test_gps_positions_in_one_place_are_refused_before_any_prediction():
+    places = local_positions(np.array([[47.0, 8.0, 400.0]] * 3)).tolist()
+    with pytest.raises(UserError, match="all have the same one"):
+        require_in_view(Gps((0, 1, 2), tuple(map(tuple, places))), None, [])

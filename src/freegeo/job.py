@@ -212,6 +212,12 @@ class Job:
         """The adapter that is in the model by now, if any."""
         return vars(self).get("in_place")
 
+    def release(self) -> None:
+        """Take the adapter of the result off the model, if it is there."""
+        if self._attached is not None:
+            self._attached.detach()
+            del self.in_place
+
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
         found = self.make()

@@ -23,9 +23,18 @@ from freegeo.geometry.se3 import camera_centres
 from freegeo.geometry.sim3 import umeyama
 
 if TYPE_CHECKING:
-    from freegeo.types import PhotoLike
+    from freegeo.types import ImageBatch, PhotoLike
 
-__all__ = ["Distances", "Gps", "Measured", "ScaleSource", "in_metres", "read_scale", "scale_to_metres"]
+__all__ = [
+    "Distances",
+    "Gps",
+    "Measured",
+    "ScaleSource",
+    "in_metres",
+    "read_scale",
+    "require_in_view",
+    "scale_to_metres",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -42,6 +51,8 @@ GPS_SPREAD = 0.25
 """Error of GPS positions, in the extent of the path, above which they give no scale."""
 GPS_OUTLIER = 3.0
 """Positions with an error of more than so many medians are left out."""
+SAME_PLACE_M = 1e-3
+"""GPS positions that differ by less are one: EXIF data have them to about a centimetre."""
 LINE = 0.02
 """Width of a path, as a share of its length, below which it is a line."""
 _GPS_IFD, _LAT_REF, _LAT, _LON_REF, _LON, _ALT_REF, _ALT = 0x8825, 1, 2, 3, 4, 5, 6
@@ -135,6 +146,29 @@ def _measured(line: str, sizes: dict[str, tuple[int, int]]) -> Measured:
     return Measured(photos=names, pixels=pixels, metres=numbers[4])
 
 
+def require_in_view(source: ScaleSource, batch: ImageBatch, photos: Sequence[PhotoLike]) -> None:
+    """Raise UserError for a scale that no prediction of these photos can have; cheap, and done before any.
+
+    A measured place must be in the model's image of its photo, which may be cut, and GPS positions must differ.
+    """
+    if isinstance(source, Gps):
+        if np.ptp(np.array(source.positions), axis=0).max() < SAME_PLACE_M:
+            raise UserError(
+                f"--scale gps: the {len(source.views)} photos with a GPS position all have the same one, which tells "
+                f"no scale. Give a measured distance, such as {FORM}."
+            )
+        return
+    for measured in source.measured:
+        for name, pixel in zip(measured.photos, measured.pixels, strict=True):
+            view = batch.names.index(name)
+            place = _in_image(pixel, photos[view], batch.scale_xy[view].numpy(), batch.offset_xy[view].numpy())
+            if not _is_inside(place, batch.image_hw):
+                raise UserError(
+                    f"--scale: {name}:{pixel[0]:g},{pixel[1]:g} lies in the part of the photo that is cut off for the "
+                    "model. Choose another place, or use --mixed pad."
+                )
+
+
 def in_metres(result: Reconstruction, source: ScaleSource, photos: Sequence[PhotoLike]) -> Reconstruction:
     """Bring a reconstruction to metres (`scale_to_metres`); it comes back as it is where it is sure of them already."""
     found = scale_to_metres(result, source, photos)
@@ -185,11 +219,7 @@ def _length(result: Reconstruction, measured: Measured, photos: Sequence[PhotoLi
 def _point(result: Reconstruction, name: str, pixel: tuple[float, float], photos: Sequence[PhotoLike]) -> np.ndarray:
     """World point (3,) that a photo shows at a pixel."""
     view = result.names.index(name)
-    place = np.array(pixel) + HALF  # counted from the corner
-    photo = photos[view]
-    if isinstance(photo, UndistortedPhoto):
-        place = photo.from_original(place[None])[0]
-    place = place * result.scale_xy[view] + result.offset_xy[view] - HALF
+    place = _in_image(pixel, photos[view], result.scale_xy[view], result.offset_xy[view])
     z = _depth_at(result.depth_z[view], result.valid_pixels()[view], place)
     if z is None:
         raise UserError(f"--scale: there is no depth at {name}:{pixel[0]:g},{pixel[1]:g}. Choose another place.")
@@ -198,10 +228,23 @@ def _point(result: Reconstruction, name: str, pixel: tuple[float, float], photos
     return T[:3, :3].T @ (camera - T[:3, 3])
 
 
+def _in_image(pixel: tuple[float, float], photo: PhotoLike, scale_xy: np.ndarray, offset_xy: np.ndarray) -> np.ndarray:
+    """Where the pixel of a photo is in the model's image, in whose first pixel's middle is 0, 0."""
+    place = np.array(pixel) + HALF  # counted from the corner
+    if isinstance(photo, UndistortedPhoto):
+        place = photo.from_original(place[None])[0]
+    return place * scale_xy + offset_xy - HALF
+
+
+def _is_inside(place: np.ndarray, image_hw: tuple[int, int]) -> bool:
+    height, width = image_hw
+    return bool(np.isfinite(place).all() and (place >= -HALF).all() and (place < (width - HALF, height - HALF)).all())
+
+
 def _depth_at(depth_z: np.ndarray, valid: np.ndarray, place: np.ndarray) -> float | None:
     """Depth at a place: bilinear on one surface, that of the nearest pixel at an edge; None where there is none."""
     height, width = depth_z.shape
-    if not (np.isfinite(place).all() and (place >= -HALF).all() and (place < (width - HALF, height - HALF)).all()):
+    if not _is_inside(place, depth_z.shape):
         return None
     nearest = np.floor(place + HALF).astype(int).clip(0, (width - 1, height - 1))
     if not valid[nearest[1], nearest[0]]:

@@ -185,9 +185,9 @@ def reconstruct(
     Raises:
         UserError: an argument that cannot be used, or views that do not fit into memory together.
     """
-    _require_model(model)
+    require_model(model)
     require_pose_from(model.spec, pose_from)
-    _warn_of_model(model)
+    warn_of_model(model)
     compute = Compute.choose(device, precision)
     if cameras is not None or scale is not None:
         require_cameras(model.spec)
@@ -295,7 +295,7 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
 
     UserError when the folder holds no adapter, when it was made for another model, or when the model carries one.
     """
-    _require_model(model)
+    require_model(model)
     return adapter_files.load_adapter(model, folder)
 
 
@@ -371,11 +371,11 @@ def adapt(
         FreeGeoError: a loss or gradient that is not finite.
         NoEvidenceError: recipe `evidence`, and the matches between the photos prove no cameras.
     """
-    _require_model(model)
+    require_model(model)
     model.adaptable()
-    _warn_of_model(model)
+    warn_of_model(model)
     compute = Compute.choose(device, precision)
-    plan = _recipe(recipe, model, dataset).changed(
+    plan = named_recipe(recipe, model, dataset).changed(
         steps=steps, epochs=epochs, lr=lr, rank=rank, hold=hold, views=views,
         keep=None if keep is None else tuple(keep), sets_per_scene=sets, loss=loss,
     )  # fmt: skip
@@ -536,7 +536,8 @@ def judge_by_photos(
     result.verdict = verdict.as_dict()
 
 
-def _recipe(recipe: str | Recipe, model: ReconstructionModel, dataset: str | None) -> Recipe:
+def named_recipe(recipe: str | Recipe, model: ReconstructionModel, dataset: str | None) -> Recipe:
+    """Return a recipe for a model; UserError for a name that is none, or a dataset that has no part in it."""
     if isinstance(recipe, str):
         return recipes.named(recipe, model.spec, dataset)
     if not isinstance(recipe, Recipe):
@@ -546,14 +547,15 @@ def _recipe(recipe: str | Recipe, model: ReconstructionModel, dataset: str | Non
     return recipe
 
 
-def _require_model(model: object) -> None:
+def require_model(model: object) -> None:
+    """Raise UserError for something that is no model, such as the name of one."""
     if isinstance(model, ReconstructionModel):
         return
     hint = f"freegeo.load_model({model!r})" if isinstance(model, str) else "freegeo.load_model"
     raise UserError(f"model is a loaded model, not {type(model).__name__}. Load it with {hint}.")
 
 
-def _warn_of_model(model: ReconstructionModel) -> None:
+def warn_of_model(model: ReconstructionModel) -> None:
     """Say once what a model is not for, or what its results lack."""
     name, caution = model.spec.name, model.spec.caution
     if name in _warned_of or not (caution or name == EMBEDDED_MODEL):

@@ -140,6 +140,23 @@ def told(known: KnownCameras | None, batch: ImageBatch, spec: ModelSpec) -> tupl
     return (None, None) if known is None else told_of(known, priors_of(known, batch), spec)
 
 
+def told_in_chunks(known: KnownCameras | None, batch: ImageBatch, spec: ModelSpec) -> tuple[Priors | None, str | None]:
+    """Do as `told` for photos that are predicted in chunks, each of which is told what it can take of its own photos.
+
+    The priors may hold what the model can take in some chunks only (`freegeo.models.priors.usable`).
+    """
+    priors, sentence = told(known, batch, spec)
+    if known is None or priors is not None or spec.takes != "cameras":
+        return priors, sentence
+    whole = int((known.has_pose & known.has_K).sum())
+    if not whole:
+        return priors, sentence
+    return priors_of(known, batch), (
+        f"{spec.name} takes poses and intrinsics of all photos of a chunk, or none: both are known of {whole} of "
+        f"{len(known)} photos, and chunks with others see the photos alone."
+    )
+
+
 def told_of(known: KnownCameras, found: Priors, spec: ModelSpec) -> tuple[Priors | None, str]:
     """Return what a model is told of priors that were made of known cameras, and what to say about that."""
     priors, left_out = usable(found, spec)

@@ -1,10 +1,11 @@
-"""Progress of a long piece of work: a bar in a terminal or a notebook, a line every tenth in a log file.
+"""Progress of a long piece of work: a bar in a terminal or a notebook, a line every tenth in a log file; its warnings.
 
-Everything goes to stderr. The library shows nothing unless it is asked to (`freegeo.adapt(..., progress=True)`).
+Progress goes to stderr. The library shows nothing unless it is asked to (`freegeo.adapt(..., progress=True)`).
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import sys
@@ -147,3 +148,18 @@ def _lines(title: str, total: int) -> Update:
             sys.stderr.flush()
 
     return update
+
+
+class Remembering(logging.Handler):
+    """Keeps warnings, each once, for the summary and the report of a result."""
+
+    def __init__(self) -> None:
+        """Start without any."""
+        super().__init__(logging.WARNING)
+        self.sentences: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep what a record says."""
+        sentence = record.getMessage()
+        if sentence not in self.sentences:
+            self.sentences.append(sentence)

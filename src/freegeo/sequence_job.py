@@ -7,8 +7,10 @@ chunk that is not finished.
 from __future__ import annotations
 
 import logging
+import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -23,7 +25,7 @@ from freegeo.data.photos import some_of
 from freegeo.data.video import VideoFrame
 from freegeo.errors import FreeGeoError, LostFolderError, UserError
 from freegeo.evidence.candidate import Candidate
-from freegeo.evidence.matches import find_matches
+from freegeo.evidence.matches import stored_matches
 from freegeo.export.base import KEPT_NAME
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import Reconstruction, Scale, save_streamed
@@ -48,13 +50,14 @@ from freegeo.job import (
     Job,
     write_files,
 )
-from freegeo.metres import FEWEST_POSITIONS, Gps, scale_to_metres
+from freegeo.metres import FEWEST_POSITIONS, Gps, ScaleSource, scale_to_metres
+from freegeo.models.priors import usable
 from freegeo.pipeline import capital, judge_by_photos
-from freegeo.posed import doubt_focal_length, told_of, with_one_camera
+from freegeo.posed import doubt_focal_length, told_in_chunks, with_one_camera
 from freegeo.report.page import write_report
 from freegeo.run_folder import Part
 from freegeo.sequence.assembly import CONTRADICTED, Assembly, Seams, assemble, broken, seams_between
-from freegeo.sequence.chunks import Chunk, bridge, plan_chunks, runs
+from freegeo.sequence.chunks import Chunk, OrderRule, bridge, plan_chunks, runs
 from freegeo.sequence.cuts import Jumps, find_cuts
 from freegeo.sequence.join import Joined, Member
 from freegeo.sequence.loops import Loop, agrees, loop_candidates, loop_frames, verified
@@ -66,7 +69,7 @@ if TYPE_CHECKING:
     from freegeo.cameras.known import KnownCameras
     from freegeo.evidence.matches import Matches
     from freegeo.models.api import ReconstructionModel
-    from freegeo.types import ImageBatch, PhotoLike
+    from freegeo.types import ImageBatch, PhotoLike, Priors
 
 logger = logging.getLogger(__name__)
 
@@ -84,6 +87,7 @@ LOOP_APART, FEWEST_APART = 2, 6
 """Frames of a loop are at least so many chunks, and so many frames, apart."""
 _READ_AT_ONCE = 16
 _NOT_NEEDED = "it fits to no other chunk, and these have all of its frames."
+_AT_ONE_END = "The prediction of the frames around both ends does not fit to the chunks at both of them."
 _KNOWN_MEDIANS = ("scale", "spread", "rotation_deg", "position", "focal")
 """What is said of known cameras as the median over chunks."""
 
@@ -96,10 +100,35 @@ class Plan:
     """Frames of a chunk."""
     overlap: int
     """Frames that two neighbouring chunks share."""
-    order: Literal["auto", "given", "similar"] = "auto"
-    """Order of the photos: as they are given, by what they show, or by what they show unless neighbours look alike."""
+    order: OrderRule = "auto"
     loops: bool = True
     """Whether places that the sequence comes back to are looked for."""
+
+
+@dataclass
+class Pace:
+    """How long chunks take, to say how much time those that are left need."""
+
+    count: int
+    seconds: list[float] = field(default_factory=list)
+    """Of each chunk for which something was computed; what a stopped run had finished counts for nothing."""
+    is_computed: bool = False
+    """Whether something is computed for the present chunk."""
+
+    @contextmanager
+    def measured(self) -> Generator[None]:
+        """Measure a chunk."""
+        self.is_computed, started = False, time.monotonic()
+        yield
+        if self.is_computed:
+            self.seconds.append(time.monotonic() - started)
+
+    def left(self, number: int) -> str:
+        """Say how long chunk `number` and those after it take, by the median of those measured; empty before any."""
+        if not self.seconds:
+            return ""
+        seconds = float(np.median(self.seconds)) * (self.count - number)
+        return f", last one done in about {f'{seconds:.0f} s' if seconds < 120 else f'{seconds / 60:.0f} min'}"
 
 
 @dataclass(kw_only=True)
@@ -124,8 +153,7 @@ class SequenceJob(Job):
         self.count = len(chunks)
         adaptation = self._adapted(chunks)
         self.uses_adapter = self.adapter is not None or adaptation.used
-        for number in range(len(chunks)):
-            self._attempt(chunks, number, ChunkJob.make)
+        self._attempt_all(chunks, ChunkJob.make)
         if len(self.failed) == len(chunks):
             raise FreeGeoError(f"no chunk could be predicted: {capital(next(iter(self.failed.values())))}")
         loops, tied = self._loops() if self.plan.loops and not self._is_placed else ([], [])
@@ -144,7 +172,7 @@ class SequenceJob(Job):
             )  # fmt: skip
         load = [partial(self._reader(names), k) for k in range(len(names))]
         pieces = [[Member(chunk=parts[k], sim3=found.sim3[k], load=load[k]) for k in piece] for piece in found.pieces]
-        loops = self._held(found, loops)
+        loops = self._held(found, loops, parts, len(numbers))
         told = self._told_of(chunks, numbers, found, loops)
         return self._write(list(zip(pieces, found.frames, strict=True)), told, adaptation)
 
@@ -189,6 +217,8 @@ class SequenceJob(Job):
             own = [Chunk(frames=(0,))] if alone else plan_chunks(end - start, size, min(self.plan.overlap, size - 1))
             chunks += [replace(chunk, frames=tuple(start + frame for frame in chunk.frames)) for chunk in own]
         self._doubt_photos(jumps.doubtful)
+        if jumps.cuts:
+            self._doubt_scale([range(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)])
         for start in jumps.cuts:
             one, two = (self.photos[i].name for i in (start - 1, start))
             self._warn(
@@ -196,6 +226,30 @@ class SequenceJob(Job):
                 "Photos of what lies between would join both parts."
             )
         return chunks
+
+    def _doubt_scale(self, parts: Sequence[range]) -> None:
+        """Say, before anything is predicted, that no part between cuts shows what --scale names; refuse it if certain.
+
+        A loop may join parts.
+        """
+        if self.scale is None or any(self._scale_of(part) is not None for part in parts):
+            return
+        sentence = (
+            f"--scale says nothing of any of the {len(parts)} parts that the sequence is cut into: it takes both "
+            f"places of a distance, or {FEWEST_POSITIONS} GPS positions, in one of them."
+        )
+        if not self.plan.loops:
+            raise UserError(f"{sentence} Measure a distance in one of them, or leave --scale out.")
+        logger.info("%s Unless a loop joins parts, lengths will be up to scale.", sentence)
+
+    def _scale_of(self, frames: Sequence[int]) -> ScaleSource | None:
+        """Return what --scale says of some frames, None where that is too little."""
+        if isinstance(self.scale, Gps):
+            positions = self.scale.select(frames)
+            return positions if len(positions.views) >= FEWEST_POSITIONS else None
+        assert self.photos is not None and self.scale is not None
+        distances = self.scale.among([self.photos[i].name for i in frames])
+        return distances if distances.measured else None
 
     def _doubt_photos(self, doubtful: Sequence[int]) -> None:
         """Name photos that may not belong to the others, and those of a camera that stands still."""
@@ -238,8 +292,7 @@ class SequenceJob(Job):
         """Predict all chunks with the frozen model, and train one adapter for all; without a recipe, nothing."""
         if self.recipe is None:
             return Adaptation()
-        for number in range(len(chunks)):
-            self._attempt(chunks, number, ChunkJob.frozen)
+        self._attempt_all(chunks, ChunkJob.frozen)
         self.usable = {number: chunk for number, chunk in enumerate(chunks) if number not in self.failed}
         if not self.usable:
             return Adaptation()
@@ -247,10 +300,9 @@ class SequenceJob(Job):
         used = self._may_use(rejected, verdict)
         if rejected is not None:
             self._warn(f"{capital(rejected)} The result is that of the frozen model.")
-        if not used and self._attached is not None:
+        if not used:
             # What is predicted from here on is the frozen model's, also when this process trained the adapter.
-            self._attached.detach()
-            del self.in_place
+            self.release()
         return Adaptation(used=used, rejected=rejected, verdict=verdict)
 
     def _scene_images(self) -> SceneImages:
@@ -267,7 +319,7 @@ class SequenceJob(Job):
                 Evidence(
                     photos=[self.photos[i] for i in own], batch=self.batch.select(own).read,
                     frozen=partial(Reconstruction.load, place / FROZEN_FOLDER),
-                    priors=None if self.priors is None else self.priors.select(own), store=place / MATCHES_NAME,
+                    priors=self._priors_of(own), store=place / MATCHES_NAME,
                     name=f"chunk {number}", frames=chunk.frames,
                 )
             )  # fmt: skip
@@ -278,41 +330,58 @@ class SequenceJob(Job):
 
     # -- chunks
 
-    def _job(self, chunk: Chunk, number: int | None = None, count: int = 0) -> ChunkJob:
-        """Return the job of a chunk; a loop has no number."""
+    def _job(self, chunk: Chunk, number: int | None = None, pace: Pace | None = None) -> ChunkJob:
+        """Return the job of a chunk; a tie has no number, and no `pace`."""
         assert self.photos is not None
         frames = list(chunk.frames)
         name = _tie_name(chunk) if number is None else _chunk_name(number)
         label = (
-            f"chunk {number} (frames {chunk}), {number + 1} of {count}"
-            if number is not None
+            f"chunk {number} (frames {chunk}), {number + 1} of {pace.count}{pace.left(number)}"
+            if number is not None and pace is not None
             else f"{chunk.tie} of frames {chunk}"
         )
+
+        def stage(name: str) -> None:
+            if pace is not None:
+                pace.is_computed = True
+            self.hooks.stage(f"{label}: {name}")
+
         values = {f.name: getattr(self, f.name) for f in fields(Job)}
         values |= {
             "batch": self.batch.select(frames), "photos": [self.photos[i] for i in frames],
             "folder": self.folder.sub(f"{CHUNKS_FOLDER}/{name}"),
             "known": None if self.known is None else self.known.select(frames),
-            "priors": None if self.priors is None else self.priors.select(frames), "masks": None, "scale": None,
-            "hooks": Hooks(stage=lambda stage: self.hooks.stage(f"{label}: {stage}")),
+            "priors": self._priors_of(frames), "masks": None, "scale": None,
+            "hooks": Hooks(stage=stage),
         }  # fmt: skip
         return ChunkJob(**values, whole=self, is_tie=chunk.tie is not None)
 
-    def _attempt(self, chunks: Sequence[Chunk], number: int, work: Callable[[ChunkJob], object]) -> None:
-        """Do something with a chunk; go on without it, and say so, when there is no usable prediction of it."""
-        if number in self.failed:
-            return
-        _, reason = _tried(work, self._job(chunks[number], number, len(chunks)))
-        if reason is not None:
-            self.failed[number] = reason
-            self._warn(f"Chunk {number} (frames {chunks[number]}) is left out: {reason}")
+    def _priors_of(self, frames: Sequence[int]) -> Priors | None:
+        """Return what the model is told of some frames: what it can take of these, whatever is known of others."""
+        return None if self.priors is None else usable(self.priors.select(frames), self.spec)[0]
+
+    def said_of_known(self) -> str | None:
+        """Return what is said of known cameras that the model is told, or not told; None without any."""
+        return told_in_chunks(self.known, self.batch, self.spec)[1]
+
+    def _attempt_all(self, chunks: Sequence[Chunk], work: Callable[[ChunkJob], object]) -> None:
+        """Do something with each chunk; go on without one, and say so, when there is no usable prediction of it."""
+        pace = Pace(len(chunks))
+        for number, chunk in enumerate(chunks):
+            if number in self.failed:
+                continue
+            with pace.measured():
+                _, reason = _tried(work, self._job(chunk, number, pace))
+            if reason is not None:
+                self.failed[number] = reason
+                self._warn(f"Chunk {number} (frames {chunk}) is left out: {reason}")
 
     def _loops(self) -> tuple[list[Loop], list[Chunk]]:
         """Look for places that the sequence comes back to: what was found, and a chunk for each one that holds."""
         assert self.photos is not None
         with self._timed("places seen twice", JOINING):
             candidates = loop_candidates(self.descriptors, apart=max(FEWEST_APART, LOOP_APART * self.plan.size))
-            loops = verified(candidates, self.photos, self.descriptors)
+            loops = verified(candidates, self.photos, self.descriptors, match=self._loop_matches)
         tied = []
         for number, loop in enumerate(loops):
             if loop.reason is None:
@@ -325,15 +394,26 @@ class SequenceJob(Job):
                     loops[number] = replace(loop, reason=reason)
         return loops, tied
 
-    def _held(self, found: Assembly, loops: list[Loop]) -> list[Loop]:
-        """Return the loops, with the reason where they contradict what is known of the places of chunks."""
-        if not any(joint.reason == CONTRADICTED for joint in found.joints):
-            return loops
-        self._warn(
-            "Places that the photos come back to, as matches say, contradict each other or the way between them: "
-            "places that look alike deceive matches. No loop is closed."
-        )
-        return [replace(loop, reason=loop.reason or CONTRADICTED) for loop in loops]
+    def _held(self, found: Assembly, loops: list[Loop], parts: Sequence[Chunk], first: int) -> list[Loop]:
+        """Return the loops, with the reason where one has no part in the places of chunks.
+
+        `first` is the place among `parts` of the chunk of the first loop that held until now; the others follow.
+        """
+        held, number = [], first
+        for loop in loops:
+            if loop.reason is None:
+                held.append(replace(loop, reason=_not_closed(found, loop, parts, number)))
+                number += 1
+            else:
+                held.append(loop)
+        contradicted = sum(loop.reason == CONTRADICTED for loop in held)
+        if contradicted:
+            self._warn(
+                "Places that the photos come back to, as matches say, contradict each other or the way between them: "
+                f"places that look alike deceive matches. {contradicted} of {number - first} loops are left out: all "
+                "in the part of the sequence where that is so."
+            )
+        return held
 
     def _refuted(self, chunk: Chunk, loop: Loop) -> str | None:
         """Predict the frames around both ends of a loop together; returns why that cannot be used."""
@@ -341,8 +421,16 @@ class SequenceJob(Job):
         made, reason = _tried(ChunkJob.make, self._job(chunk))
         if made is None:
             return reason
-        matches = find_matches([self.photos[frame] for frame in loop.frames])
+        matches = self._loop_matches(loop.frames)
         return agrees(Candidate.of(made.result, str(self.compute.device)), chunk.frames, loop, matches).reason
+
+    def _loop_matches(self, frames: Sequence[int]) -> Matches:
+        """Match the photos of both ends of a loop, or read their matches, which are kept for a run that continues."""
+        assert self.photos is not None
+        name = "-".join(f"{frame:06d}" for frame in frames)
+        return stored_matches(
+            self.folder / CHUNKS_FOLDER / f"loop-{name}.npz", [self.photos[frame] for frame in frames]
+        )
 
     def _bridges(self, parts: Sequence[Chunk], seams: Seams) -> list[Chunk]:
         """Predict the frames around each seam that does not hold together, which may tie its chunks."""
@@ -502,14 +590,9 @@ class SequenceJob(Job):
         """Return what brings a piece to metres; None, with a warning, where --scale says nothing of its photos."""
         if self.scale is None:
             return None
-        if isinstance(self.scale, Gps):
-            source = self.scale.select(frames)
-            known = len(source.views) >= FEWEST_POSITIONS
-        else:
-            source = self.scale.among(result.names)
-            known = len(source.measured) > 0
+        source = self._scale_of(frames)
         where = f"the piece of {len(frames)} photos between frames {frames[0]} and {frames[-1]}"
-        if not known:
+        if source is None:
             self._warn(f"--scale says nothing of {where}: its lengths are {result.lengths}.")
             return None
         try:
@@ -533,7 +616,7 @@ class SequenceJob(Job):
         sums = {name: sum(one[name] for one in measured) for name in ("points", "views")}
         return {
             **told[0], **(medians or {}), "poses": int(self.known.has_pose.sum()),
-            "intrinsics": int(self.known.has_K.sum()),
+            "intrinsics": int(self.known.has_K.sum()), "model": self.said_of_known(),
             "measured": {**(_medians(measured) or {}), **sums} if measured else None,
         }  # fmt: skip
 
@@ -574,6 +657,21 @@ def _tried(work: Callable[[ChunkJob], Made], job: ChunkJob) -> tuple[Made | None
         raise
     except FreeGeoError as error:
         return None, str(error)
+
+
+def _not_closed(found: Assembly, loop: Loop, parts: Sequence[Chunk], number: int) -> str | None:
+    """Return why a loop has no part in the places of chunks; None: its chunk `number` ties both ends together."""
+    own = [joint for joint in found.joints if number in (joint.first, joint.second)]
+    if any(joint.reason == CONTRADICTED for joint in own):
+        return CONTRADICTED
+    shared = {
+        frame
+        for joint in own
+        if joint.reason is None
+        for frame in {*parts[joint.first].frames} & {*parts[joint.second].frames}
+    }
+    ends = {2 * frame > loop.first + loop.second for frame in shared}
+    return None if len(ends) == 2 else _AT_ONE_END
 
 
 def _chunk_name(number: int) -> str:
@@ -643,12 +741,6 @@ class ChunkJob(Job):
     @property
     def _attached(self) -> Adapter | None:
         return self.whole._attached
-
-    def said_of_known(self) -> str | None:
-        """Return what is said of known cameras: a chunk is told its part of what the whole sequence can be told."""
-        if self.known is None or self.priors is None:
-            return self.whole.said_of_known()
-        return told_of(self.known, self.priors, self.spec)[1]
 
     def make(self) -> Computed:
         """Write the result of the chunk; an adapter that was trained is judged already."""

@@ -74,7 +74,7 @@ def test_command_line_is_quoted_as_it_could_be_typed():
 def test_interrupt_and_sigterm_have_codes_of_their_own_and_say_how_to_go_on(
     freegeo, monkeypatch, tmp_path, stop, code, words
 ):
-    def interrupt(*arguments):
+    def interrupt(*arguments, **options):
         raise stop
 
     monkeypatch.setattr("freegeo.cli.reconstruct.load_source", interrupt)
@@ -91,7 +91,7 @@ def test_interrupt_and_sigterm_have_codes_of_their_own_and_say_how_to_go_on(
 def caught(monkeypatch) -> list:
     """What `run` would have done."""
     calls = []
-    monkeypatch.setattr("freegeo.cli.run.load_source", lambda sources, limit: calls.append((sources, limit)))
+    monkeypatch.setattr("freegeo.cli.run.load_source", lambda sources, limit, **_: calls.append((sources, limit)))
     monkeypatch.setattr("freegeo.cli.options.ModelOptions.load", lambda self: type("Model", (), {"spec": None}))
     monkeypatch.setattr("freegeo.cli.options.RecipeOptions.build", lambda self, spec: self)
     monkeypatch.setattr("freegeo.cli.run.run_job", lambda *args, **options: calls.append((args, options)))
@@ -307,7 +307,7 @@ def test_a_log_on_a_full_disk_is_one_sentence(monkeypatch, capfd, arguments):
 
 
 def test_names_of_files_that_are_no_text_are_refused(freegeo, monkeypatch, tmp_path):
-    def write(*arguments):
+    def write(*arguments, **options):
         (tmp_path / "x.json").write_text('{\n  "names": [\n    "\udcff1.png",\n    "2.png"]', encoding="utf-8")
 
     monkeypatch.setattr("freegeo.cli.reconstruct.load_source", write)

@@ -100,7 +100,7 @@ def test_refused_cameras_leave_a_result_that_is_there(freegeo, photo_folder, tin
     def refuse(*arguments, **options):
         raise UserError("the cameras do not fit")
 
-    monkeypatch.setattr("freegeo.posed.check_known", refuse)
+    monkeypatch.setattr("freegeo.runs.check_known", refuse)
     # Cameras that were trusted are not taken for checked ones.
     outcome = freegeo(*command, "--cameras", file)
     assert outcome.code == 2 and "the cameras do not fit" in outcome.sentence()

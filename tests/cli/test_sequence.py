@@ -5,26 +5,29 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from freegeo import job, sequence_job
+from freegeo import job, load_model, reconstruct_sequence, sequence_job
 from freegeo.adaptation.adapter import is_adapted
 from freegeo.cameras.known import KnownCamera, KnownCameras
 from freegeo.cameras.plain import write
 from freegeo.data.procedural import render, sample_rooms
-from freegeo.errors import FreeGeoError
+from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.pixels import corner_K
 from freegeo.export.reconstruction import Reconstruction, open_reconstruction
 from freegeo.fusion.tracks import Tracks
 from freegeo.geometry.sim3 import Sim3, align_cameras
 from freegeo.refined import Refined
+from freegeo.sequence.chunks import Chunk
 from freegeo.sequence.cuts import Jumps
+from freegeo.sequence.loops import Loop
 from freegeo.sequence.order import descriptors
-from freegeo.sequence_job import SequenceJob
+from freegeo.sequence_job import Pace, SequenceJob
 from freegeo.types import ImageBatch
 
 FRAMES, CHUNK, OVERLAP = 14, 6, 3
@@ -147,6 +150,64 @@ def test_a_stopped_run_continues_at_the_first_chunk_that_is_not_finished(freegeo
     assert len(oracle.asked) == COUNT
 
 
+@pytest.mark.slow
+def test_python_writes_what_the_command_writes(freegeo, walk, tiny, weights, tmp_path, oracle):
+    assert freegeo("reconstruct", walk, "-o", tmp_path / "command", *tiny, *CHUNKS).code == 0
+    oracle.asked.clear()
+    model = load_model("freegeo-tiny", checkpoint=weights)
+    call = {"chunk": CHUNK, "overlap": OVERLAP, "order": "given"}
+    found = reconstruct_sequence(model, walk, tmp_path / "python", **call)
+    assert repr(found) == f"SequenceResult({FRAMES} views)" and len(oracle.asked) == COUNT
+    one, two = arrays(tmp_path / "command"), arrays(tmp_path / "python")
+    assert one.keys() == two.keys() and all(np.array_equal(one[name], two[name]) for name in one)
+    np.testing.assert_array_equal(found.result.depth_z, one["depth_z"])
+    names = [{file.name for file in (tmp_path / place).iterdir()} for place in ("command", "python")]
+    assert names[0] == names[1]
+    again = reconstruct_sequence(model, walk, tmp_path / "python", **call)
+    assert again.summary == found.summary and len(oracle.asked) == COUNT
+    with pytest.raises(UserError, match="with other options"):
+        reconstruct_sequence(model, walk, tmp_path / "python", **{**call, "overlap": 2})
+
+
+@pytest.mark.slow
+def test_a_dark_photo_is_named_once_and_the_plan_is_without_it(freegeo, walk, tiny, tmp_path, oracle):
+    shutil.copytree(walk, tmp_path / "walk")
+    Image.new("RGB", (64, 48)).save(tmp_path / "walk/05.png")
+    outcome = freegeo("reconstruct", tmp_path / "walk", "-o", tmp_path / "out", *tiny, *CHUNKS)
+    assert outcome.code in {0, 3}, outcome.err
+    assert f"{FRAMES - 1} photos in {COUNT} chunks of {CHUNK}" in outcome.err
+    assert outcome.err.count("almost black") == 1
+    assert sum("05.png" in sentence for sentence in told(tmp_path / "out")["warnings"]) == 1
+
+
+def test_the_time_that_is_left_is_that_of_chunks_that_were_computed():
+    pace = Pace(9)
+    with pace.measured():
+        pass  # finished by an earlier run
+    assert pace.left(1) == ""
+    pace.seconds += [30.0, 10.0, 10.0]
+    assert pace.left(4) == ", last one done in about 50 s"
+    pace.count = 99
+    assert pace.left(9) == ", last one done in about 15 min"
+
+
+def test_a_loop_is_used_where_its_prediction_fits_at_both_ends():
+    loop = Loop(first=1, second=12, similarity=0.9, matches=99, frames=(0, 1, 2, 11, 12, 13), reason=None)
+    parts = [Chunk(frames=(0, 1, 2)), Chunk(frames=(11, 12, 13)), Chunk(frames=(0, 1, 12, 13), tie="loop")]
+    fits, fails = (SimpleNamespace(first=0, second=2, reason=None), SimpleNamespace(first=1, second=2, reason="no."))
+    assert sequence_job._not_closed(SimpleNamespace(joints=[fits, fails]), loop, parts, 2)
+    fails.reason = None
+    assert sequence_job._not_closed(SimpleNamespace(joints=[fits, fails]), loop, parts, 2) is None
+
+
+def test_a_distance_across_a_cut_is_refused_before_any_prediction(freegeo, walk, tiny, tmp_path, oracle, monkeypatch):
+    monkeypatch.setattr(sequence_job, "find_cuts", lambda *_: Jumps(cuts=[7], doubtful=[]))
+    command = ["reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS, "--no-loops", "--scale"]
+    outcome = freegeo(*command, "00.png:10,10 13.png:50,40 = 2")
+    assert outcome.code == 2 and "--scale says nothing of any of the 2 parts" in outcome.sentence()
+    assert oracle.asked == []
+
+
 def unlike(result: Reconstruction) -> Reconstruction:
     """An answer whose depth fits nothing."""
     noise = np.random.default_rng(0).lognormal(0, 1, result.depth_z.shape)
@@ -242,21 +303,37 @@ def test_what_follows_an_adapter_that_is_not_used_is_predicted_by_the_frozen_mod
     assert adapted == [False]
 
 
-def test_chunks_with_known_cameras_stay_where_they_are(freegeo, walk, tiny, tmp_path, oracle, truth):
+def cameras_of(truth: Reconstruction) -> list[KnownCamera]:
+    """The true cameras, exactly orthonormal."""
     cameras = []
     for given, K in zip(truth.cameras()[0].astype(np.float64), corner_K(truth), strict=True):
         u, _, vh = np.linalg.svd(given[:3, :3])
         T = given.copy()
         T[:3, :3] = u @ vh
         cameras.append(KnownCamera(T_cam_world=T, K=K, size_hw=(48, 64)))
-    file = tmp_path / "cameras.json"
+    return cameras
+
+
+def test_chunks_with_known_cameras_stay_where_they_are(freegeo, walk, tiny, tmp_path, oracle, truth, monkeypatch):
+    """Each is told its own cameras; those of the last photo are known in part."""
+    cameras = cameras_of(truth)
+    cameras[-1] = replace(cameras[-1], K=None)
+    file, told_them = tmp_path / "cameras.json", []
     write(KnownCameras(names=truth.names, cameras=tuple(cameras), source="x"), file)
+
+    def predict(model: object, batch: ImageBatch, **options: object) -> Reconstruction:
+        told_them.append(options["priors"] is not None)
+        return oracle(model, batch)
+
+    monkeypatch.setattr(job, "predict", predict)
     options = ("--cameras", file, "--trust-cameras", "--refine", "off")
     outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS, *options)
     assert outcome.code == 0, outcome.err
     expected = np.stack([camera.T_cam_world for camera in cameras])
     np.testing.assert_allclose(open_reconstruction(tmp_path / "out").cameras()[0], expected, atol=1e-12)
     assert [chunk["piece"] for chunk in told(tmp_path / "out")["sequence"]["chunks"]] == [0] * COUNT
+    assert told_them == [True] * (COUNT - 1) + [False]
+    assert "both are known of 13 of 14 photos" in told(tmp_path / "out")["known_cameras"]["model"]
 
 
 @pytest.mark.slow

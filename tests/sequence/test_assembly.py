@@ -140,3 +140,19 @@ def test_loops_that_contradict_each_other_or_the_chain_are_all_left_out(whole):
     assert reasons == {CONTRADICTED}
     assert all(joint.reason is None for joint in found.joints if joint.kind != "loop")
     assert found.pieces == [list(range(len(chunks)))]
+
+
+def test_loops_that_contradict_each_other_leave_those_of_another_part_alone(whole):
+    """The same walk twice, the second time as other frames."""
+    walk, loop = plan_chunks(FRAMES, 8, 2), Chunk(frames=(0, 1, 12, 13), tie="loop")
+    again = [replace(chunk, frames=tuple(frame + FRAMES for frame in chunk.frames)) for chunk in (*walk, loop)]
+    chunks, shown = [*walk, *again[:-1], loop, replace(loop), again[-1]], [*walk, *walk, loop, loop, loop]
+    parts = [part_of(whole, chunk, similarity(number)) for number, chunk in enumerate(shown)]
+    T = parts[-2].cameras()[0].copy()
+    T[2:] = T[2:] @ np.linalg.inv(T[2]) @ T[0]
+    parts[-2] = replace(parts[-2], T_cam_world=T)
+    found = assemble(chunks, seams_between(chunks, parts.__getitem__), parts.__getitem__)
+    wrong, right = ({len(chunks) - 3, len(chunks) - 2}, {len(chunks) - 1})
+    for ties, reason in ((wrong, CONTRADICTED), (right, None)):
+        assert {joint.reason for joint in found.joints if ties & {joint.first, joint.second}} == {reason}
+    assert [len(frames) for frames in found.frames] == [FRAMES, FRAMES]

@@ -11,8 +11,9 @@ import torch
 from evidence_tools import turned
 from freegeo.data.photos import MemoryPhoto
 from freegeo.data.procedural import RoomBatch, render, sample_rooms
+from freegeo.evidence import matches as evidence_matches
 from freegeo.evidence.candidate import Candidate
-from freegeo.evidence.matches import find_matches
+from freegeo.evidence.matches import find_matches, stored_matches
 from freegeo.sequence.loops import Loop, agrees, loop_candidates, loop_frames, verified
 
 PHOTO_HW = (144, 192)
@@ -251,3 +252,14 @@ def test_loop_frames_lie_around_both_ends(first, second, count, size):
 def test_half_of_a_loop_chunk_is_at_each_end():
     assert loop_frames(30, 80, 100, 8) == (28, 29, 30, 31, 78, 79, 80, 81)
     assert loop_frames(0, 99, 100, 6) == (0, 1, 2, 97, 98, 99)
+
+
+def test_a_loop_is_the_same_by_matches_that_were_kept(tmp_path, monkeypatch):
+    taken, seen = photos(("room", HERE), ("room", AGAIN)), places(*range(6), *range(6))
+
+    def kept(frames):
+        return stored_matches(tmp_path / "loop.npz", [taken[frame] for frame in frames])
+
+    expected, first = [true_loop()[0]], verified([(*ENDS, 0.9)], taken, seen, match=kept)
+    monkeypatch.setattr(evidence_matches, "_matched", lambda job: pytest.fail("matched again"))
+    assert verified([(*ENDS, 0.9)], taken, seen, match=kept) == first == expected

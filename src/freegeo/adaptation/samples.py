@@ -72,7 +72,7 @@ class SceneImages:
     targets: CameraTargets | None = None
     """Cameras of the images to learn from; needed by a recipe with the weight `cameras`."""
     priors: Priors | None = None
-    """What teacher and student are told of the images, all of which the model can take (`models.priors.usable`)."""
+    """What teacher and student are told of the images: of each view set, what the model can take (`usable_by_both`)."""
     windows: Windows | None = None
     """Groups of images that show one part of a long sequence: each view set is drawn from one of them; None: from all
     images (`views.chunk_windows`)."""

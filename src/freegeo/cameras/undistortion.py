@@ -64,6 +64,11 @@ class UndistortedPhoto:
         return self.photo.size_hw
 
     @property
+    def blank(self) -> bool:
+        """Whether the original is known to be almost black, white or of one colour."""
+        return getattr(self.photo, "blank", False)
+
+    @property
     def camera(self) -> KnownCamera:
         """The camera of the undistorted photo: a pinhole."""
         return replace(self.original, K=self.K, lens=None, size_hw=self.size_hw)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
-from freegeo.cli.jobs import LABELS, check_inputs, check_place, say_finished, size_settings
+from freegeo.cli.jobs import check_inputs, check_place, say_finished
 from freegeo.cli.options import CameraOptions, ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source, split_scenes
 from freegeo.progress import step_bar
@@ -61,6 +61,7 @@ def adapt(
     from freegeo.pipeline import require_enough_photos, scene_images
     from freegeo.posed import check_known, told
     from freegeo.run_folder import run_folder
+    from freegeo.runs import LABELS, size_settings
 
     check_place(output)
     empty = model.build_empty()

@@ -8,7 +8,6 @@ from typing import Annotated
 from cyclopts import App, Parameter
 
 from freegeo.cli import console
-from freegeo.cli.jobs import adapter_identity
 from freegeo.cli.options import model_of_adapter
 from freegeo.errors import UserError
 from freegeo.models.spec import NO_REFERENCE
@@ -53,6 +52,7 @@ def merge(
     from freegeo.adaptation.adapter_files import find_adapter, load_adapter
     from freegeo.models import catalog
     from freegeo.models.checkpoints import fingerprint, save_weights
+    from freegeo.runs import adapter_identity
 
     adapter = find_adapter(adapter)
     name = model_of_adapter(adapter, model)

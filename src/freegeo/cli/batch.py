@@ -22,7 +22,7 @@ from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
 from freegeo.cli.export import stored_summary
 from freegeo.cli.files import FileOptions
-from freegeo.cli.jobs import DEFAULT_FILES, adapter_identity, check_place, planned
+from freegeo.cli.jobs import DEFAULT_FILES, check_place, planned
 from freegeo.cli.options import (
     ModelOptions,
     OutputOptions,
@@ -148,6 +148,8 @@ def batch(
     planned(empty, recipe if adapting else None, refine=refine, pose_from=pose_from, placing=placing)
     found = _look_at_all(named, photos, files, adapting=adapting, has_cameras=empty.spec.cameras)
     model.warn_of_embedded([source for scene in named for source in scene.sources])
+    from freegeo.runs import adapter_identity
+
     common = [model.checkpoint_identity["fingerprint"], None if adapter is None else adapter_identity(adapter)]
     options = [*as_arguments(model), *as_arguments(placing), *as_arguments(sequence), *as_arguments(files)]
     options += [f"--refine={refine}", f"--pose-from={pose_from}"]

@@ -14,9 +14,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
+from freegeo.progress import Remembering
+
 STANDARD_OUTPUT = "standard output"
 _typed: list[str] = []
-_warned: list[str] = []
+_memory = Remembering()
 
 
 def configure_logging(verbose: bool) -> None:
@@ -26,8 +28,8 @@ def configure_logging(verbose: bool) -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(_Formatter())
     logger.addHandler(handler)
-    logger.addHandler(_Remembering(logging.WARNING))
-    _warned.clear()
+    logger.addHandler(_memory)
+    _memory.sentences.clear()
     logger.setLevel(logging.DEBUG if verbose else logging.INFO)
     logger.propagate = False
     warnings.showwarning = _show_warning  # ty: ignore[invalid-assignment]
@@ -44,22 +46,13 @@ class _Formatter(logging.Formatter):
         return f"warning: {text}" if record.levelno >= logging.WARNING else text
 
 
-class _Remembering(logging.Handler):
-    """Keep warnings, each once, for the summary and the report."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        sentence = record.getMessage()
-        if sentence not in _warned:
-            _warned.append(sentence)
-
-
 def warned() -> list[str]:
     """Return the warnings of this command so far: the list itself, which later warnings are added to.
 
     Any module warns of a doubtful result with `logging.getLogger(__name__).warning`, in one sentence; the log, the
     summary (`reconstruction.json`) and the report show it.
     """
-    return _warned
+    return _memory.sentences
 
 
 def _show_warning(

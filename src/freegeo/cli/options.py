@@ -18,9 +18,8 @@ from freegeo.cli.sources import DEMO
 from freegeo.errors import UserError
 from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL, entry, warn_of_embedded_model
 from freegeo.models.spec import MIXED, Mixed
+from freegeo.sequence.chunks import OrderRule
 
-OrderRule = Literal["auto", "given", "similar"]
-"""Order of photos that are predicted in chunks (docs/sequences.md, "Order")."""
 Refine = Literal["auto", "ba", "off"]
 """Whether bundle adjustment of matches between the photos follows (docs/refinement.md); `auto`: where its extra is
 installed."""
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from freegeo.models.api import ReconstructionModel
     from freegeo.models.precision import Compute
     from freegeo.models.spec import ModelSpec
-    from freegeo.sequence_job import Plan
+    from freegeo.runs import SequenceWish
     from freegeo.types import PhotoLike
 
 
@@ -341,50 +340,12 @@ class SequenceOptions:
     order: OrderRule = "auto"
     """Order of the photos: given; similar: by what they show; auto: given, unless neighbours do not look alike."""
 
-    def plan(
-        self,
-        model: ReconstructionModel,
-        photos: Sequence[PhotoLike],
-        mixed: Mixed,
-        compute: Compute,
-        *,
-        process_res: int | None = None,
-        before: int | None = None,
-    ) -> Plan | None:
-        """Return how photos are cut into chunks; None where all are predicted at once.
+    def wish(self) -> SequenceWish:
+        """Return what is asked for; UserError for a size of chunks that is none."""
+        from freegeo.runs import SequenceWish
 
-        `before` is the size of a chunk in the run that is continued, which `auto` keeps: what fits into memory may be
-        another number now.
-        """
-        from freegeo.adaptation.memory import plan_reconstruction
-        from freegeo.models.images import read_some
-        from freegeo.sequence.chunks import OVERLAP, plan_chunks
-        from freegeo.sequence_job import Plan
-
-        count, image_hw = len(photos), read_some(model, photos, [0], mixed, process_res).image_hw
-        _, fitting = plan_reconstruction(model, 1, image_hw, compute=compute)
-        size = (before or min(fitting, model.spec.chunk)) if self.chunk == "auto" else self._size()
-        if min(size, count) > fitting:
-            raise UserError(
-                f"--chunk {size}: at most {fitting} photos of {image_hw[1]} x {image_hw[0]} pixels fit into memory "
-                f"together with {model.spec.name}. Take --chunk {fitting}."
-            )
-        overlap = max(1, int(size * OVERLAP)) if self.overlap is None else self.overlap
-        chunks = plan_chunks(count, size, overlap)
-        if len(chunks) == 1:
-            return None
-        if not model.spec.cameras:
-            raise UserError(
-                f"{model.spec.name} predicts no cameras, so that chunks of {count} photos cannot be joined. Take "
-                "another model, or --max-views."
-            )
-        parts, _ = plan_reconstruction(model, size, image_hw, compute=compute)
-        peak = sum(bytes for _, bytes in parts)
-        console.note(
-            f"{count} photos in {len(chunks)} chunks of {size}, neighbours share {overlap}: about {peak / 1e9:.1f} GB "
-            "of memory at a time"
-        )
-        return Plan(size=size, overlap=overlap, order=self.order, loops=self.loops)
+        chunk = None if self.chunk == "auto" else self._size()
+        return SequenceWish(chunk=chunk, overlap=self.overlap, order=self.order, loops=self.loops)
 
     def _size(self) -> int:
         if not self.chunk.isdecimal() or int(self.chunk) < 2:

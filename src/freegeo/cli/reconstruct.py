@@ -57,7 +57,7 @@ def reconstruct(
     if adapter is not None:
         adapter = find_adapter(adapter)
         model = model.for_adapter(adapter)
-    found = load_source(sources, photos)
+    found = load_source(sources, photos, doubt=False)  # once it is known which are left out
     model.warn_of_embedded(sources)
     run_job(
         found, model, output, command="reconstruct", recipe=None, adapter=adapter, mixed=photos.mixed,

@@ -58,7 +58,7 @@ def run(
         camera: cameras of the model's camera head; rays: found from the rays that it predicts (any-view models of DA3).
     """
     refines_with(cameras, refine)  # refused, where it has to be, before photos are read
-    found = load_source(sources, photos)
+    found = load_source(sources, photos, doubt=False)  # once it is known which are left out
     model.warn_of_embedded(sources)
     plan = recipe if adapt else None
     run_job(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from collections.abc import Sequence
 from glob import has_magic
 from pathlib import Path
@@ -21,10 +20,12 @@ DEMO_DOMAIN = "big"
 DEMO_FRAMES = 16
 
 
-def load_source(sources: Sequence[str], photos: PhotoOptions) -> list[PhotoLike]:
-    """Return the photos of one scene: several files are one scene, in the order given."""
-    from freegeo.data.photos import MAX_VIEWS, load_photos
-    from freegeo.data.video import is_video
+def load_source(sources: Sequence[str], photos: PhotoOptions, *, doubt: bool = True) -> list[PhotoLike]:
+    """Return the photos of one scene: several files are one scene, in the order given.
+
+    `doubt`: warn of photos that are almost black, white or of one colour.
+    """
+    from freegeo.data.photos import all_of, doubt_blank
 
     require_sources(sources)
     if list(sources) == [DEMO]:
@@ -32,10 +33,10 @@ def load_source(sources: Sequence[str], photos: PhotoOptions) -> list[PhotoLike]
     if len(sources) > 1:
         _refuse_several_scenes(sources)
     source = sources[0] if len(sources) == 1 else list(sources)
-    most = photos.max_views
-    if most is None:
-        most = MAX_VIEWS if is_video(sources[0]) and photos.fps is None else sys.maxsize
-    return load_photos(source, most, fps=photos.fps, skip_bad=photos.skip_bad)
+    found = all_of(source, photos.max_views, fps=photos.fps, skip_bad=photos.skip_bad)
+    if doubt:
+        doubt_blank(found)
+    return found
 
 
 def _refuse_several_scenes(sources: Sequence[str]) -> None:

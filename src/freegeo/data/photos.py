@@ -7,6 +7,7 @@ import logging
 import os
 import re
 import shlex
+import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -65,6 +66,8 @@ class Photo:
     """Height and width after EXIF rotation."""
     white: float | None = None
     """Value that is white, of a file with more than 8 bits a channel; None: judged by the file's values."""
+    blank: bool = False
+    """Whether it is almost black, white or of one colour, as far as that is known."""
 
     def read(self) -> np.ndarray:
         """Decode to upright RGB (H, W, 3) uint8; transparent pixels become white."""
@@ -92,6 +95,11 @@ class MemoryPhoto:
         """Height and width."""
         return self.pixels.shape[0], self.pixels.shape[1]
 
+    @property
+    def blank(self) -> bool:
+        """Whether it is almost black, white or of one colour."""
+        return is_blank(self.pixels)
+
     def read(self) -> np.ndarray:
         """Return the pixels (H, W, 3) uint8."""
         return self.pixels
@@ -118,14 +126,24 @@ def load_photos(
         UserError: a file is missing, or photos are unreadable, no photos, or too large, or an image in memory is not
             of the kind above; the message names all of them.
     """
+    found = found_photos(source, max_views, fps=fps, skip_bad=skip_bad)
+    if not _is_loaded(source):
+        doubt_blank(found)
+    return found
+
+
+def found_photos(
+    source: PhotoSource, max_views: int, *, fps: float | None = None, skip_bad: bool = False
+) -> list[PhotoLike]:
+    """Do as `load_photos`, and leave it to the caller to say which photos are blank (`doubt_blank`)."""
     if max_views < 1:
         raise UserError(f"--max-views must be at least 1, got {max_views}.")
     if isinstance(source, str | Path) and (path := _as_video(source)) is not None:
         return list(load_video(path, fps=fps, max_views=max_views))
     if fps is not None:
         raise UserError("--fps is for videos; the source is none.")
-    if isinstance(source, list | tuple) and source and all(map(_is_photo, source)):
-        return _named_once([item for item in source if _is_photo(item)])
+    if _is_loaded(source):
+        return _named_once(source)
     found = find_photos(source)
     if len(found) > max_views:
         logger.info("%d photos found, %d kept, evenly spaced (--max-views)", len(found), max_views)
@@ -138,15 +156,33 @@ def load_photos(
         if not isinstance(item, Path):
             photos.append(item)
         elif item in looks:
-            photos.append(Photo(names[item], item, looks[item].size_hw, looks[item].white))
-    blank = {names[file] for file, look in looks.items() if look.blank}
-    blank |= {photo.name for photo in photos if isinstance(photo, MemoryPhoto) and is_blank(photo.pixels)}
-    if blank:
+            look = looks[item]
+            photos.append(Photo(names[item], item, look.size_hw, look.white, look.blank))
+    return _named_once(photos)
+
+
+def all_of(
+    source: PhotoSource, max_views: int | None, *, fps: float | None = None, skip_bad: bool = False
+) -> list[PhotoLike]:
+    """Do as `found_photos`; None keeps all photos, and `MAX_VIEWS` frames of a video without `fps`."""
+    if max_views is None:
+        a_choice = isinstance(source, str | Path) and is_video(source) and fps is None
+        max_views = MAX_VIEWS if a_choice else sys.maxsize
+    return found_photos(source, max_views, fps=fps, skip_bad=skip_bad)
+
+
+def blank_photos(photos: Sequence[PhotoLike]) -> list[str]:
+    """Return the names of the photos that are known to be almost black, white or of one colour."""
+    return [photo.name for photo in photos if getattr(photo, "blank", False)]
+
+
+def doubt_blank(photos: Sequence[PhotoLike]) -> None:
+    """Warn of photos that are almost black, white or of one colour."""
+    if blank := blank_photos(photos):
         logger.warning(
             "%d of %d photos are almost black, white or of one colour: %s. Look whether they are meant to be.",
-            len(blank), len(photos), some_of([photo.name for photo in photos if photo.name in blank]),
+            len(blank), len(photos), some_of(blank),
         )  # fmt: skip
-    return _named_once(photos)
 
 
 def open_photos(files: Sequence[Path]) -> list[Photo]:
@@ -160,6 +196,11 @@ def open_photos(files: Sequence[Path]) -> list[Photo]:
 def _header(path: Path) -> tuple[int, int]:
     with opened(path) as image:
         return size_hw(image, orientation(image))
+
+
+def _is_loaded(source: PhotoSource) -> TypeGuard[Sequence[PhotoLike]]:
+    """Whether a source is what `load_photos` returned."""
+    return isinstance(source, list | tuple) and bool(source) and all(map(_is_photo, source))
 
 
 def _is_photo(item: Any) -> TypeGuard[PhotoLike]:

@@ -80,7 +80,12 @@ def look_at_photos(
         batch = read_some(model, photos, range(start, min(start + _AT_A_TIME, len(photos))), mixed, process_res)
         contents.update(batch.digest().encode())
         pixels = (batch.images * 255).byte().permute(0, 2, 3, 1).numpy()
-        blank += [start + row for row, image in enumerate(pixels) if is_blank(image)]
+        blank += [
+            start + row
+            for row, image in enumerate(pixels)
+            # Where a photo is padded, its image is not blank.
+            if is_blank(image) or getattr(photos[start + row], "blank", False)
+        ]
         looks.append(replace(batch, images=batch.images[:, :, :0, :0]))
         shape = batch.images.shape[1:]
     geometry = {name: torch.cat([getattr(b, name) for b in looks]) for name in ("photo_hw", "scale_xy", "offset_xy")}

@@ -9,6 +9,8 @@ from functools import lru_cache
 from itertools import combinations
 from typing import Any, Literal
 
+import numpy as np
+
 from freegeo.geometry.sim3 import Sim3
 from freegeo.sequence.alignment import INLIER, Depths, Seam, align, gap
 from freegeo.sequence.chunks import Chunk, common_rows
@@ -19,7 +21,7 @@ Kind = Literal["neighbours", "bridge", "loop"]
 Load = Callable[[int], Depths]
 Seams = Mapping[tuple[int, int], Seam]
 """By the numbers of two chunks, the smaller first."""
-CONTRADICTED = "loops contradict each other or the seams between neighbours, so that none of them is used."
+CONTRADICTED = "in this part of the sequence loops contradict each other or the seams between neighbours: none is used."
 _OPEN = 4
 """Chunks that are held in memory."""
 
@@ -132,14 +134,14 @@ def assemble(
     found = place(len(chunks), edges, fixed_scale=fixed_scale)
     loops = {pair for pair in good if _kind(chunks, *pair) == "loop"}
     # Which one is wrong cannot be told: of places that look alike several may agree, against a true loop.
-    contradicted = any(trust == 0 for trust in found.trust)
+    contradicted = loops & _connected(len(chunks), good, [trust == 0 for trust in found.trust])
     if contradicted:
-        edges = [edge for pair, edge in zip(good, edges, strict=True) if pair not in loops]
+        edges = [edge for pair, edge in zip(good, edges, strict=True) if pair not in contradicted]
         found = place(len(chunks), edges, fixed_scale=fixed_scale)
     of = {number: k for k, piece in enumerate(found.pieces) for number in piece}
     joints = []
     for (a, b), seam in seams.items():
-        reason = CONTRADICTED if contradicted and (a, b) in loops else seam.reason
+        reason = CONTRADICTED if (a, b) in contradicted else seam.reason
         distance = apart(a, b, found.sim3) if of[a] == of[b] else None
         joints.append(
             Joint(first=a, second=b, kind=_kind(chunks, a, b), seam=seam, gap=distance, reason=reason)
@@ -151,6 +153,19 @@ def assemble(
         joints=joints, sim3=found.sim3, pieces=[piece for piece, own in zip(pieces, frames, strict=True) if own],
         frames=[own for own in frames if own],
     )  # fmt: skip
+
+
+def _connected(count: int, pairs: Sequence[tuple[int, int]], chosen: Sequence[bool]) -> set[tuple[int, int]]:
+    """Return the pairs of chunks that other pairs connect with one of the chosen ones, and these."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    if not any(chosen):
+        return set()
+    first, second = np.array(pairs).T
+    part = connected_components(coo_array((np.ones(len(pairs)), (first, second)), shape=(count, count)), False)[1]
+    found = set(part[first[np.array(chosen)]].tolist())
+    return {pair for pair in pairs if part[pair[0]] in found}
 
 
 def _own_frames(chunks: Sequence[Chunk], pieces: Sequence[Sequence[int]]) -> list[list[int]]:

@@ -8,6 +8,9 @@ from typing import Literal
 
 from freegeo.errors import UserError
 
+OrderRule = Literal["auto", "given", "similar"]
+"""Order of photos that are predicted in chunks: as they are given, by what they show, or by what they show unless
+neighbours look alike (docs/sequences.md, "Order")."""
 OVERLAP = 0.5
 """Share of a chunk that is in the next one too, unless it is given."""
 

@@ -6,14 +6,14 @@ docs/sequences.md, "Loops", describes the rules and what they were measured on.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from freegeo.evidence.candidate import Candidate
-from freegeo.evidence.matches import Matches, MatchSettings, find_matches
+from freegeo.evidence.matches import Matches, find_matches
 from freegeo.evidence.scores import epipolar
 from freegeo.sequence.order import SAME_PICTURE, new_pictures
 
@@ -124,7 +124,7 @@ def verified(
     photos: Sequence[PhotoLike],
     descriptors: np.ndarray,
     *,
-    settings: MatchSettings | None = None,
+    match: Callable[[Sequence[int]], Matches] | None = None,
 ) -> list[Loop]:
     """Match the photos around both ends of each candidate; a `Loop` with a reason is refused.
 
@@ -137,9 +137,13 @@ def verified(
         candidates: from `loop_candidates`.
         photos: of all frames; six are read for each candidate.
         descriptors: (N, C) of all frames.
-        settings: how photos are matched; None: the defaults.
+        match: matches all pairs of some frames, or reads their matches; None: `find_matches`.
     """
-    return [_verified(candidate, photos, descriptors, settings) for candidate in candidates]
+
+    def found(frames: Sequence[int]) -> Matches:
+        return find_matches([photos[frame] for frame in frames])
+
+    return [_verified(candidate, len(photos), descriptors, match or found) for candidate in candidates]
 
 
 def agrees(candidate: Candidate, frames: Sequence[int], loop: Loop, matches: Matches) -> Agreement:
@@ -189,13 +193,13 @@ def _mutual(descriptors: np.ndarray, frames: np.ndarray, apart: int) -> tuple[np
 
 def _verified(
     found: tuple[int, int, float],
-    photos: Sequence[PhotoLike],
+    count: int,
     descriptors: np.ndarray,
-    settings: MatchSettings | None,
+    match: Callable[[Sequence[int]], Matches],
 ) -> Loop:
     first, second, similarity = found
-    frames = _around(first, second, _step(descriptors, first, second, similarity), len(photos))
-    found_matches = find_matches([photos[frame] for frame in frames], settings=settings)
+    frames = _around(first, second, _step(descriptors, first, second, similarity), count)
+    found_matches = match(frames)
     pairs, ends = found_matches.pairs, [frames.index(first), frames.index(second)]
     across, own = _across(pairs) & np.isin(pairs, ends).any(1), ~_across(pairs)
     partners = min(int((across & (pairs == end).any(1)).sum()) for end in ends)

@@ -1,0 +1,611 @@
+"""A run into an output folder: photos are read, settings compared with those of the folder, and a job does the rest.
+
+`freegeo run` and its kin share this with `freegeo.reconstruct_sequence`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+from freegeo.adaptation.adapt import require_unchanged_images
+from freegeo.adaptation.adapter import is_adapted
+from freegeo.adaptation.adapter_files import WEIGHTS, find_adapter, read_peft
+from freegeo.adaptation.memory import plan_reconstruction
+from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Guard, Recipe, require_seed
+from freegeo.cameras.undistortion import UndistortedPhoto
+from freegeo.data.photos import all_of, doubt_blank, some_of
+from freegeo.data.video import VideoFrame
+from freegeo.errors import UserError
+from freegeo.evidence.bundle import pycolmap_module
+from freegeo.export.base import DEFAULT_FORMATS, DepthSize
+from freegeo.export.formats import check_formats
+from freegeo.export.photos import FOLDER as COPIES_FOLDER
+from freegeo.export.photos import write_copies
+from freegeo.export.reconstruction import Reconstruction
+from freegeo.files import read_json
+from freegeo.fusion.settings import FilterSettings
+from freegeo.job import MATCHES_NAME, PARTS, SUMMARY_NAME, Hooks, Job
+from freegeo.metres import read_scale, require_in_view
+from freegeo.models.checkpoints import fingerprint
+from freegeo.models.images import chosen_side, look_at_photos, read_photos, read_some
+from freegeo.models.precision import Compute
+from freegeo.models.reference import require_no_choice, require_rule
+from freegeo.models.spec import MIXED, NO_REFERENCE, Mixed, ModelSpec, PoseFrom
+from freegeo.pipeline import (
+    named_recipe,
+    require_enough_photos,
+    require_model,
+    require_pose_from,
+    require_reference,
+    warn_of_model,
+)
+from freegeo.posed import check_known, digest, is_one_camera, known_cameras, require_cameras, told, told_in_chunks
+from freegeo.progress import Remembering, step_bar
+from freegeo.run_folder import run_folder, stored_state
+from freegeo.sequence.chunks import OVERLAP, OrderRule, plan_chunks
+from freegeo.sequence_job import SEQUENCE_PARTS, Plan, SequenceJob
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from freegeo.cameras.known import KnownCameras
+    from freegeo.data.photos import PhotoSource
+    from freegeo.metres import ScaleSource
+    from freegeo.models.api import ReconstructionModel
+    from freegeo.models.images import Frames
+    from freegeo.types import ImageBatch, PhotoLike, Priors
+
+__all__ = ["Inputs", "SequenceResult", "read_inputs", "reconstruct_sequence", "run_in_folder", "settings_of"]
+
+logger = logging.getLogger(__name__)
+
+_OTHER_CONTENTS = "photos with other contents, or read at another size"
+LABELS = {
+    "photos": "other photos", "photo_contents": _OTHER_CONTENTS, "contents": _OTHER_CONTENTS, "scenes": "other scenes",
+    "checkpoint": "other weights", "weights": "another adapter", "folder": "--adapter", "masks": "other masks",
+    "known_cameras": "other known cameras", "trusted_cameras": "--trust-cameras",
+    "scale": "another --scale",
+    "one_camera": "--one-camera",
+    "command": "the command", "recipe": "--adapt", "name": "--recipe", "sets_per_scene": "--sets",
+    "adapting_precision": "--precision", "refinement": "--refine",
+    **dict.fromkeys(
+        ("alpha", "first_seed", "distinct_seeds", "final_lr", "batch", "features", "cameras"),
+        "what follows from the recipe",
+    ),
+    **{
+        name: f"--{name}"
+        for name in (
+            "model", "precision", "seed", "reference", "adapter", "steps", "epochs", "lr", "rank", "hold", "views",
+            "keep", "room", "domain", "published", "guard",
+        )
+    },
+    "pose_from": "--pose-from",
+    "process_res": "--process-res",
+    "chunk": "--chunk", "overlap": "--overlap", "order": "--order", "loops": "--loops",
+    "judged_by": "the predictions that the guard judges by",
+}  # fmt: skip
+"""What messages call the settings of an output folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceWish:
+    """How more photos than are predicted at once are to become one result; `Plan` is what comes of it."""
+
+    chunk: int | None = None
+    """Photos that are predicted together; None: as many as fit into memory, at most as many as suit the model."""
+    overlap: int | None = None
+    """Photos that two neighbouring chunks share; None: half of a chunk."""
+    order: OrderRule = "auto"
+    loops: bool = True
+
+    def check(self) -> None:
+        """Raise UserError for values of a caller that are no numbers of photos, or no rule."""
+        for name, value in (("chunk", self.chunk), ("overlap", self.overlap)):
+            if value is not None and (not isinstance(value, int) or isinstance(value, bool)):
+                raise UserError(f"{name} is a number of photos, or None, not {value!r}.")
+        if self.order not in get_args(OrderRule):
+            raise UserError(f"order is {', '.join(get_args(OrderRule))}, not {self.order!r}.")
+
+    def plan(
+        self,
+        model: ReconstructionModel,
+        photos: Sequence[PhotoLike],
+        compute: Compute,
+        *,
+        mixed: Mixed = MIXED,
+        process_res: int | None = None,
+        before: int | None = None,
+    ) -> Plan | None:
+        """Return how photos are cut into chunks; None where all are predicted at once.
+
+        `before` is the size of a chunk in the run that is continued, which is kept where none is asked for: what fits
+        into memory may be another number now.
+        """
+        count, image_hw = len(photos), read_some(model, photos, [0], mixed, process_res).image_hw
+        _, fitting = plan_reconstruction(model, 1, image_hw, compute=compute)
+        size = (before or min(fitting, model.spec.chunk)) if self.chunk is None else self.chunk
+        if min(size, count) > fitting:
+            raise UserError(
+                f"--chunk {size}: at most {fitting} photos of {image_hw[1]} x {image_hw[0]} pixels fit into memory "
+                f"together with {model.spec.name}. Take --chunk {fitting}."
+            )
+        overlap = max(1, int(size * OVERLAP)) if self.overlap is None else self.overlap
+        if len(plan_chunks(count, size, overlap)) == 1:
+            return None
+        if not model.spec.cameras:
+            raise UserError(
+                f"{model.spec.name} predicts no cameras, so that chunks of {count} photos cannot be joined. Take "
+                "another model, or --max-views."
+            )
+        return Plan(size=size, overlap=overlap, order=self.order, loops=self.loops)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Inputs:
+    """The photos of a job, and what is known of them; all parts have the same photos in the same order."""
+
+    photos: Sequence[PhotoLike]
+    batch: ImageBatch
+    chunks: Plan | None
+    """How they are cut into chunks; None: they are predicted at once."""
+    known: KnownCameras | None
+    priors: Priors | None
+    masks: list[np.ndarray] | None
+    scale: ScaleSource | None
+    one_camera: bool
+
+
+def read_inputs(
+    photos: Sequence[PhotoLike],
+    model: ReconstructionModel,
+    recipe: Recipe | None,
+    wish: SequenceWish,
+    compute: Compute,
+    *,
+    known: KnownCameras | None = None,
+    masks: list[np.ndarray] | None = None,
+    mixed: Mixed = MIXED,
+    process_res: int | None = None,
+    reference: str | None = None,
+    scale: str | None = None,
+    one_camera: bool | None = None,
+    before: int | None = None,
+) -> Inputs:
+    """Read photos and what belongs to them; UserError for what does not go together.
+
+    Of a sequence, the photos that show nothing are left out, and its plan is logged.
+
+    Args:
+        photos: without distortion.
+        model: decides the size of images; its weights have no part in that.
+        recipe: by which the model is adapted to the photos; None: it is not.
+        wish: how photos are cut into chunks, where they are too many to be predicted at once.
+        compute: where the model runs, whose memory limits what is predicted at once.
+        known: cameras of the photos.
+        masks: one for each photo.
+        mixed: how photos of different shapes get one size.
+        process_res: longest side of images; None: the model's default.
+        reference: rule of the reference view that was asked for.
+        scale: where metres come from (`freegeo.metres.read_scale`).
+        one_camera: whether photos of one camera share a focal length; None: those of a video do.
+        before: how many photos an earlier run of the folder predicted together.
+    """
+    chunks = wish.plan(model, photos, compute, mixed=mixed, process_res=process_res, before=before)
+    if chunks is None:
+        doubt_blank(photos)
+        batch: ImageBatch = read_photos(model, photos, mixed=mixed, process_res=process_res)
+    else:
+        _require_adaptable(chunks, recipe)
+        frames = look_at_photos(model, photos, mixed=mixed, process_res=process_res)
+        shown = _shown(frames)
+        batch, photos = frames.select(shown), [photos[view] for view in shown]
+        known = None if known is None else known.select(shown)
+        masks = None if masks is None else [masks[view] for view in shown]
+        _require_joinable(known)
+        _say_plan(chunks, model, batch, compute)
+    priors, sentence = (told if chunks is None else told_in_chunks)(known, batch, model.spec)
+    if sentence:
+        logger.info("%s", sentence)
+    require_reference(reference, priors)
+    if recipe is not None and priors is not None:
+        require_unchanged_images(recipe)
+    source = None if scale is None else read_scale(scale, photos)
+    if source is not None:
+        require_in_view(source, batch, photos)
+    return Inputs(
+        photos=photos, batch=batch, chunks=chunks, known=known, priors=priors, masks=masks, scale=source,
+        one_camera=is_one_camera(photos) if one_camera is None else one_camera,
+    )  # fmt: skip
+
+
+def _shown(frames: Frames) -> list[int]:
+    """Return the photos of a sequence that show something, and say which ones are left out."""
+    shown = frames.shown()
+    if not shown:
+        raise UserError(f"all {len(frames)} photos are almost black, white or of one colour. Give photos of a scene.")
+    blank = [name for view, name in enumerate(frames.names) if view not in set(shown)]
+    if blank:
+        logger.warning(
+            "%d of %d photos are almost black, white or of one colour, and are left out: %s.",
+            len(blank), len(frames), some_of(blank),
+        )  # fmt: skip
+    return shown
+
+
+def _require_adaptable(chunks: Plan, recipe: Recipe | None) -> None:
+    """Raise UserError for a recipe that cannot adapt to chunks."""
+    if recipe is None:
+        return
+    if chunks.size < SMALLEST_SCENE:
+        raise UserError(
+            f"--chunk {chunks.size}: adaptation needs chunks of at least {SMALLEST_SCENE} photos. Take larger ones, or "
+            "reconstruct without adapting (--no-adapt)."
+        )
+    if recipe.cameras:
+        raise UserError(
+            f"recipe {recipe.name} learns from cameras of one chunk, and these are more photos than are predicted at "
+            "once. Take recipe scene, or --max-views."
+        )
+
+
+def _require_joinable(known: KnownCameras | None) -> None:
+    """Raise UserError for known cameras that chunks cannot have."""
+    if known is not None and known.has_pose.any() and not known.has_pose.all():
+        raise UserError(
+            f"{known.source}: of some photos the pose is known and of others not, and these are more photos than are "
+            "predicted at once. Give the poses of all photos, or of none, or only the photos whose poses are known."
+        )
+
+
+def _say_plan(chunks: Plan, model: ReconstructionModel, batch: ImageBatch, compute: Compute) -> None:
+    """Log chunks, overlap and memory; how long it takes is measured on the first chunk, and said from then on."""
+    count = len(plan_chunks(len(batch), chunks.size, chunks.overlap))
+    parts, _ = plan_reconstruction(model, min(chunks.size, len(batch)), batch.image_hw, compute=compute)
+    peak = sum(size for _, size in parts)
+    memory = f"{peak / 1e9:.1f} GB" if peak >= 1e8 else f"{peak / 1e6:.0f} MB"
+    logger.info(
+        "%d photos in %d chunks of %d, neighbours share %d: about %s of memory at a time; the time is measured on "
+        "the first chunk",
+        len(batch), count, chunks.size, chunks.overlap, memory,
+    )  # fmt: skip
+
+
+def together_before(folder: Path) -> int | None:
+    """Return how many photos the run in a folder predicts together; None where there is none."""
+    state = stored_state(folder)
+    adaptation = {} if state is None else state["settings"].get("adaptation") or {}
+    if "sequence" in adaptation:
+        return adaptation["sequence"]["chunk"]
+    return len(adaptation["photos"]) if adaptation.get("photos") else None
+
+
+def settings_of(
+    found: Inputs,
+    spec: ModelSpec,
+    recipe: Recipe | None,
+    *,
+    command: str,
+    model: Mapping[str, object],
+    adapter: Path | None,
+    guard: Guard,
+    reference: str | None,
+    pose_from: PoseFrom,
+    trusted: bool,
+    refine: bool,
+    filters: Mapping[str, object],
+    formats: Sequence[str],
+    depth_size: DepthSize = "model",
+    extra: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Return what the result in a folder depends on, in the parts that jobs know (`freegeo.job.PARTS`).
+
+    Args:
+        found: photos and what is known of them.
+        spec: of the model.
+        recipe: of the adaptation, if there is one.
+        command: what writes the folder.
+        model: what identifies model, weights, precision and seed.
+        adapter: folder of a saved adapter.
+        guard: whether matches judge the adapter.
+        reference: rule of the reference view that was asked for.
+        pose_from: where cameras of predictions come from.
+        trusted: known poses are not checked.
+        refine: whether bundle adjustment follows.
+        filters: which points are kept.
+        formats: files to write.
+        depth_size: of depth files.
+        extra: further settings, on which everything depends.
+    """
+    adaptation: dict[str, Any] = {
+        "photos": list(found.batch.names), "photo_contents": found.batch.digest(), **model,
+        "recipe": None if recipe is None else asdict(recipe),
+        "guard": None if recipe is None else guard,
+        "adapter": None if adapter is None else adapter_identity(adapter),
+        **({} if found.priors is None else {"known_cameras": found.priors.digest()}),
+        **size_settings(found.batch),
+    }  # fmt: skip
+    # Only where it is not the default, so that folders of earlier versions count as finished.
+    rays = {} if pose_from == "camera" else {"pose_from": pose_from}
+    rule = reference or spec.reference
+    judged = rays | ({} if rule == spec.reference else {"reference": rule})
+    if recipe is not None and guard != "off" and judged:
+        adaptation["judged_by"] = judged
+    if (chunks := found.chunks) is not None:
+        adaptation["sequence"] = {"chunk": chunks.size, "overlap": chunks.overlap, "order": chunks.order}
+    return {
+        "command": command,
+        **(extra or {}),
+        "adaptation": adaptation,
+        "prediction": {"reference": rule, **rays},
+        **_placing_settings(found, trusted=trusted),
+        "refinement": "ba" if refine else "off",
+        **({} if chunks is None else {"joining": {"loops": chunks.loops}}),
+        "filters": filters,
+        "formats": formats,
+        # Only where it is not the default, so that folders of earlier versions count as finished.
+        **({} if depth_size == "model" else {"depth_size": depth_size}),
+    }
+
+
+def size_settings(batch: ImageBatch) -> dict[str, int]:
+    """Return the part of settings about the size of images; empty for the model's default."""
+    return {} if batch.process_res is None else {"process_res": batch.process_res}
+
+
+def _placing_settings(found: Inputs, *, trusted: bool) -> dict[str, Any]:
+    """Return the part of settings about known and shared cameras, and scale; empty without any of them."""
+    values = {
+        "known_cameras": None if found.known is None else digest(found.known), "one_camera": found.one_camera,
+        "scale": None if found.scale is None else hashlib.sha256(repr(found.scale).encode()).hexdigest()[:16],
+        **({"trusted_cameras": True} if found.known is not None and trusted else {}),
+    }  # fmt: skip
+    return {"placing": values} if any(values.values()) else {}
+
+
+def adapter_identity(folder: Path) -> dict[str, str]:
+    """Return what identifies an adapter; UserError when the folder holds none."""
+    read_peft(folder)
+    return {"folder": str(folder.resolve()), "weights": fingerprint(folder / WEIGHTS)}
+
+
+def run_in_folder(
+    output: Path, settings: Mapping[str, Any], found: Inputs, *, overwrite: bool, trusted: bool, **job: Any
+) -> tuple[dict[str, Any], str | None]:
+    """Start or continue a run in its folder; one that is finished is not changed.
+
+    Args:
+        output: the folder.
+        settings: from `settings_of`.
+        found: the photos.
+        overwrite: replace what an earlier run with other settings wrote.
+        trusted: known poses are not checked by matches.
+        **job: what else a `Job` takes.
+
+    Returns:
+        The content of reconstruction.json, and when the folder was finished before; None: just now.
+    """
+    unchecked = None if trusted else found.known
+    state = stored_state(output)
+    if unchecked is not None and state is not None and state["settings"].get("placing") != settings["placing"]:
+        # Before a result that is there gives way to one with cameras that may be refused.
+        _check_cameras(unchecked, found.photos)
+        unchecked = None
+    parts = PARTS if found.chunks is None else SEQUENCE_PARTS
+    with run_folder(output, settings, overwrite=overwrite, parts=parts, labels=LABELS) as folder:
+        if folder.finished:
+            return read_json(folder / SUMMARY_NAME), folder.finished_at
+        if unchecked is not None:
+            _check_cameras(unchecked, found.photos, folder / MATCHES_NAME)
+        if any(isinstance(photo, VideoFrame | UndistortedPhoto) for photo in found.photos):
+            write_copies(found.photos, folder / COPIES_FOLDER)
+        kind = Job if found.chunks is None else partial(SequenceJob, plan=found.chunks)
+        work = kind(
+            folder=folder, photos=found.photos, batch=found.batch, masks=found.masks, known=found.known,
+            priors=found.priors, one_camera=found.one_camera, scale=found.scale, **job,
+        )  # fmt: skip
+        try:
+            return work.run(), None
+        finally:
+            work.release()
+
+
+def _check_cameras(known: KnownCameras, photos: Sequence[PhotoLike], store: Path | None = None) -> None:
+    """Raise UserError for known cameras that matches between the photos contradict; `store` keeps the matches."""
+    logger.info("known cameras against matches between the photos ...")
+    check_known(known, photos, store)
+
+
+# -- for Python
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SequenceResult:
+    """The result of `freegeo.reconstruct_sequence`."""
+
+    folder: Path
+    """Where it is: the files and `report.html` that `freegeo run` writes."""
+    pieces: tuple[Reconstruction, ...]
+    """Reconstructions, mapped from files, not loaded. One, unless there are photos that could not be joined to the
+    others: each piece then has a world frame and a scale of its own. The first has the most photos."""
+    summary: Mapping[str, Any]
+    """The content of reconstruction.json: `warnings`, and `sequence` with chunks, seams, loops and pieces (where all
+    photos were predicted at once there is no `sequence`)."""
+
+    @property
+    def result(self) -> Reconstruction:
+        """The first piece."""
+        return self.pieces[0]
+
+    def __repr__(self) -> str:
+        """Return the numbers of photos, such as SequenceResult(300 views)."""
+        return f"SequenceResult({' and '.join(str(len(piece)) for piece in self.pieces)} views)"
+
+
+def reconstruct_sequence(
+    model: ReconstructionModel,
+    photos: PhotoSource,
+    output: str | Path,
+    *,
+    chunk: int | None = None,
+    overlap: int | None = None,
+    order: OrderRule = "auto",
+    loops: bool = True,
+    recipe: str | Recipe | None = None,
+    guard: Guard = "select",
+    seed: int = SEED,
+    adapter: str | Path | None = None,
+    cameras: KnownCameras | str | Path | None = None,
+    trust_cameras: bool = False,
+    one_camera: bool | None = None,
+    scale: str | None = None,
+    reference: str | None = None,
+    refine: bool = False,
+    formats: Sequence[str] = DEFAULT_FORMATS,
+    filters: FilterSettings | None = None,
+    device: str | None = None,
+    precision: str | None = None,
+    max_views: int | None = None,
+    fps: float | None = None,
+    mixed: Mixed = MIXED,
+    process_res: int | None = None,
+    pose_from: PoseFrom = "camera",
+    overwrite: bool = False,
+    progress: bool = False,
+) -> SequenceResult:
+    """Reconstruct any number of photos into a folder, as `freegeo run` and `freegeo reconstruct` do.
+
+    Of more photos than are predicted at once, chunks that overlap are predicted one after the other and joined
+    (docs/sequences.md), with a few of them in memory at a time. The same call continues a run that was stopped, and
+    reads a finished one.
+
+    Args:
+        model: from `freegeo.load_model`, without an adapter; it is moved to the device, and without one afterwards.
+        photos: what `freegeo.load_photos` takes or returned; all of them are used.
+        output: folder for the result.
+        chunk: photos that are predicted together; None: as many as fit into memory and suit the model.
+        overlap: photos that two neighbouring chunks share; None: half of a chunk.
+        order: `given`; `similar`: by what photos show; `auto`: given, unless neighbours do not look alike.
+        loops: look for places that the photos come back to, and let them correct the way between.
+        recipe: adapt the model to the photos by this recipe, one adapter for all chunks (`scene`, or a recipe of your
+            own); None: no adaptation.
+        guard: of an adaptation, as for `freegeo.adapt`.
+        seed: of everything random.
+        adapter: folder of a saved adapter, instead of a recipe.
+        cameras: known cameras, as for `freegeo.reconstruct`; of more photos than are predicted at once, poses of all
+            or of none. Photos with distortion are undistorted, and copies of them written.
+        trust_cameras: use poses without checking them by the matches between the photos.
+        one_camera: as for `freegeo.reconstruct`.
+        scale: as for `freegeo.reconstruct`; it holds for a piece that shows the measured places.
+        reference: rule of the reference view; None: the model's own.
+        refine: bring the cameras to the matches between the photos; needs the extra `colmap`.
+        formats: files to write besides the predictions, as for `Reconstruction.export`.
+        filters: which points are kept; None: the defaults.
+        device: cpu, cuda, cuda:N or mps; None: the best available.
+        precision: fp32, bf16 or fp16; None: bf16 on CUDA, else fp32.
+        max_views: most photos that are used; None: all.
+        fps: of a video, take a frame this often per second; None: 32 frames, or `max_views`, by sharpness and parallax.
+        mixed: how photos of different shapes become images of one size, as for `freegeo.reconstruct`.
+        process_res: longest side of the model's images, as for `freegeo.reconstruct`.
+        pose_from: where cameras come from, as for `freegeo.reconstruct`.
+        overwrite: replace what an earlier run with other settings wrote into the folder.
+        progress: show a bar, and log the stages; without it nothing is printed.
+
+    Raises:
+        UserError: an argument that cannot be used, or a folder with another result or with files of others.
+        FreeGeoError: no chunk has a usable prediction.
+    """
+    require_model(model)
+    if is_adapted(model):
+        raise UserError("the model carries an adapter; detach it, and give the folder of a saved one as adapter.")
+    require_pose_from(model.spec, pose_from)
+    require_seed(seed)
+    wish = SequenceWish(chunk=chunk, overlap=overlap, order=order, loops=loops)
+    wish.check()
+    if reference is not None:
+        require_rule(reference)
+        if model.spec.reference == NO_REFERENCE:
+            require_no_choice(reference, model.spec.name)
+    if recipe is not None and adapter is not None:
+        raise UserError("recipe trains an adapter, and adapter names one that is there. Leave out one of them.")
+    if refine:
+        if cameras is not None:
+            raise UserError("refine would move the cameras that are known. Leave out refine or cameras.")
+        pycolmap_module()
+    if cameras is not None or scale is not None or refine:
+        require_cameras(model.spec)
+    compute, folder = Compute.choose(device, precision), Path(output).expanduser()
+    process_res = chosen_side(model.spec, process_res)
+    with _remembered() as warned:
+        warn_of_model(model)
+        plan = None
+        if recipe is not None:
+            model.adaptable()
+            plan = named_recipe(recipe, model, None)
+        seen, known = all_of(photos, max_views, fps=fps), None
+        if plan is not None:
+            require_enough_photos(seen)
+        if cameras is not None:
+            seen, known = known_cameras(seen, cameras)
+        written = check_formats(formats, [photo.name for photo in seen], has_cameras=model.spec.cameras)
+        found = read_inputs(
+            seen, model, plan, wish, compute, known=known, mixed=mixed, process_res=process_res, reference=reference,
+            scale=scale, one_camera=one_camera, before=None if overwrite else together_before(folder),
+        )  # fmt: skip
+        saved = None if adapter is None else find_adapter(adapter)
+        points = filters or FilterSettings()
+        settings = settings_of(
+            found, model.spec, plan, command="reconstruct_sequence", model=_identity(model, compute, plan, seed),
+            adapter=saved, guard=guard, reference=reference, pose_from=pose_from, trusted=trust_cameras, refine=refine,
+            filters=asdict(points), formats=written,
+        )  # fmt: skip
+        with step_bar() if progress else nullcontext(lambda step: None) as on_step:
+            summary, _ = run_in_folder(
+                folder, settings, found, overwrite=overwrite, trusted=trust_cameras, load=lambda: model,
+                spec=model.spec, recipe=plan, adapter=saved, guard=guard, seed=seed, compute=compute,
+                hooks=Hooks(stage=_said if progress else lambda stage: None, step=on_step), reference=reference,
+                warnings=warned, formats=written, filters=points, refine=refine, pose_from=pose_from,
+                checkpoint=_checkpoint(model),
+            )  # fmt: skip
+    pieces = [part["folder"] for part in summary["sequence"]["pieces"]] if "sequence" in summary else ["."]
+    return SequenceResult(
+        folder=folder, pieces=tuple(Reconstruction.load(folder / piece) for piece in pieces), summary=summary
+    )
+
+
+def _said(stage: str) -> None:
+    logger.info("%s ...", stage)
+
+
+@contextmanager
+def _remembered() -> Generator[list[str]]:
+    """Collect the warnings of the package, for the summary and the report."""
+    memory, package = Remembering(), logging.getLogger("freegeo")
+    package.addHandler(memory)
+    try:
+        yield memory.sentences
+    finally:
+        package.removeHandler(memory)
+
+
+def _checkpoint(model: ReconstructionModel) -> dict[str, str] | None:
+    """Return file name and fingerprint of a model's weights; None for weights that came from no file."""
+    loaded = model.loaded_from
+    return None if loaded is None else {"file": loaded.file, "fingerprint": loaded.fingerprint}
+
+
+def _identity(model: ReconstructionModel, compute: Compute, recipe: Recipe | None, seed: int) -> dict[str, object]:
+    loaded = model.loaded_from
+    return {
+        "model": model.spec.name,
+        "checkpoint": None if loaded is None else loaded.fingerprint,
+        "precision": compute.precision,
+        "adapting_precision": None if recipe is None else compute.preferring(recipe.precision).precision,
+        "seed": seed,
+    }
