@@ -17,7 +17,7 @@ def adapter(tmp_path_factory, photo_folder, tiny):
     from freegeo.cli.app import main
 
     folder = tmp_path_factory.mktemp("adapter") / "adapter"
-    assert main(["adapt", str(photo_folder), "-o", str(folder), *tiny, *QUICK, "--lr", "0.01"]) == 0
+    assert main(["adapt", str(photo_folder), "-o", str(folder), *tiny, *QUICK, "--lr", "0.003"]) == 0
     return folder
 
 

@@ -96,11 +96,8 @@ def _refinement(summary: Mapping[str, Any]) -> Iterator[Part]:
             after, before = (told["after"].get(key) for key in ("depth_agreement", "depth_agreement_frozen"))
             more = ""
             if before is not None and before > after + WORSE:
-                more = (
-                    " But depth maps contradict each other more, in "
-                    f"{100 * (1 - after):.0f} % of the pixels instead of {100 * (1 - before):.0f} %: they are less exact "
-                    "than the cameras."
-                )
+                shares = f"{100 * (1 - after):.0f} % of the pixels instead of {100 * (1 - before):.0f} %"
+                more = f" But depth maps contradict each other more, in {shares}: they are less exact than the cameras."
         outcome: Outcome = "yes" if told["accepted"] else "no"
         yield Part(what="Refinement", outcome=outcome, sentence=told["reason"] + more)
 
