@@ -99,6 +99,20 @@ def atomic_folder(path: Path) -> Generator[Path]:
 
 
 @contextmanager
+def atomic_files(folder: Path, names: Sequence[str]) -> Generator[list[Path]]:
+    """Give a temporary path for each name of a file below a folder; they become its files together (`atomic_folder`).
+
+    UserError for a name that cannot be a file below a folder; other errors as `atomic_path`.
+    """
+    final = [inside(folder, name) for name in names]
+    with atomic_folder(folder) as part:
+        paths = [part / path.relative_to(folder) for path in final]
+        for path in paths:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        yield paths
+
+
+@contextmanager
 def _door(path: Path, folder: Path) -> Generator[Path]:
     """Give the temporary path for what will be `path`, and remove it afterwards; `folder` is where files are put."""
     _require_own(path, folder)

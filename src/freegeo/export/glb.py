@@ -1,8 +1,8 @@
 """``scene.glb``: coloured points and one small frustum per camera, below a node that turns them to glTF axes.
 
-Vertices are in the reconstruction's world, as in all other files. The matrix of the node `reconstruction`, their parent,
-turns that world to glTF's (y up): upright where up can be told (`freegeo.export.gravity`), otherwise its axes are only
-renamed. The scene's extras say which it is.
+Vertices are in the reconstruction's world, as in all other files. The matrix of their parent, the node
+`reconstruction`, turns it to glTF's world (y up): upright where up can be told (`freegeo.export.gravity`), otherwise
+the axes are only renamed. The scene's extras say which it is.
 """
 
 from __future__ import annotations
