@@ -1,4 +1,4 @@
-"""What the machine leaves this process: main memory, within its control group, and its answers to signals."""
+"""The machine: the main memory it leaves this process, answers to its signals, and numbers of bytes as text."""
 
 from __future__ import annotations
 
@@ -12,6 +12,20 @@ from pathlib import Path
 PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 _UNLIMITED = 1 << 60
 """Limits of a control group from here on mean that there is none."""
+
+
+def size_text(count: float) -> str:
+    """Return the size of a file in bytes as text: 512 B, 3.4 kB, 20.0 MB, 1.5 GB."""
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.1f} GB"
+
+
+def gigabytes(count: float) -> str:
+    """Return bytes of memory, of a disk or of a download as text: in GB from .05 GB on, else as `size_text`."""
+    return f"{count / 1e9:.1f} GB" if count >= 5e7 else size_text(count)
 
 
 def host_available() -> int:

@@ -22,6 +22,7 @@ from freegeo.fusion.settings import FilterSettings
 from freegeo.job import write_files
 from freegeo.report import figures, page, scene3d
 from freegeo.report.page import flattened, score_table, views, write_report
+from freegeo.report.rendering import marked
 from freegeo.report.result import load_result
 
 
@@ -59,10 +60,28 @@ def test_warnings_of_the_summary_stand_at_the_top(tmp_path):
     folder = write_example(tmp_path / "out")
     plain = write_report(folder).read_text(encoding="utf-8")
     summary = files.read_json(folder / "reconstruction.json")
-    files.write_json(folder / "reconstruction.json", {**summary, "warnings": ["Half of <b>a.png</b> is cut off."]})
+    files.write_json(
+        folder / "reconstruction.json", {**summary, "warnings": ["Half of <b>a.png</b> is cut off: `freegeo export`."]}
+    )
     page = write_report(folder).read_text(encoding="utf-8")
     assert 'class="warnings"' not in plain
-    assert page.index("Half of &lt;b&gt;a.png&lt;/b&gt; is cut off.") < page.index("<main>")
+    assert page.index("Half of &lt;b&gt;a.png&lt;/b&gt; is cut off: <code>freegeo export</code>.") < page.index(
+        "<main>"
+    )
+
+
+@pytest.mark.parametrize(
+    ("sentence", "shown"),
+    [
+        ("run `freegeo adapt <x>` again", "run <code>freegeo adapt &lt;x&gt;</code> again"),
+        ("`<script>`, `b`", "<code>&lt;script&gt;</code>, <code>b</code>"),
+        ("one ` alone", "one ` alone"),
+        ("``", "``"),
+        ("</code>`a`", "&lt;/code&gt;<code>a</code>"),
+    ],
+)
+def test_what_stands_between_backticks_is_code_and_escaped(sentence, shown):
+    assert marked(sentence) == shown
 
 
 def test_the_verdict_comes_first(tmp_path):

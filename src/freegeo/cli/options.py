@@ -16,6 +16,7 @@ from freegeo.adaptation.recipe import PAPER, SEED, DatasetName, Recipe, RecipeNa
 from freegeo.cli import console
 from freegeo.cli.sources import DEMO
 from freegeo.errors import UserError
+from freegeo.host import gigabytes
 from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL, entry, warn_of_embedded_model
 from freegeo.models.spec import MIXED, Mixed
 
@@ -381,7 +382,7 @@ class SequenceOptions:
         parts, _ = plan_reconstruction(model, size, image_hw, compute=compute)
         peak = sum(bytes for _, bytes in parts)
         console.note(
-            f"{count} photos in {len(chunks)} chunks of {size}, neighbours share {overlap}: about {peak / 1e9:.1f} GB "
+            f"{count} photos in {len(chunks)} chunks of {size}, neighbours share {overlap}: about {gigabytes(peak)} "
             "of memory at a time"
         )
         return Plan(size=size, overlap=overlap, order=self.order, loops=self.loops)

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from freegeo.errors import UserError
+from freegeo.host import gigabytes
 from freegeo.models.catalog import EMBEDDED_MODEL
 from freegeo.models.spec import ModelEntry
 
@@ -99,7 +100,7 @@ def fetch(item: ModelEntry, *, check_hash: bool = False) -> Path:
         logger.debug("download of %s failed: %r", item.hub_id, error)
         reason, remedy = why(error, _described(item))
         missing = "is not on this machine" if kept is None else f"is damaged ({kept})"
-        size = f"{item.download_bytes / 1e9:.1f} GB"
+        size = gigabytes(item.download_bytes)
         raise UserError(
             f"the checkpoint of {item.name} ({item.hub_id}, {size}) {missing} and could not be downloaded: {reason}. "
             f"{remedy} and run `freegeo models download {item.name}`, {_INSTEAD}"

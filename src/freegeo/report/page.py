@@ -15,6 +15,7 @@ from freegeo.report import figures, sequence
 from freegeo.report.answer import HEADER, NOTE, answer, rescaled
 from freegeo.report.contents import contents
 from freegeo.report.pairs import PairPicture, pair_pictures
+from freegeo.report.rendering import duration, fill
 from freegeo.report.result import LABELS, MANY_VIEWS, REPORT_NAME, Result, camera_difference, even_choice, load_result
 from freegeo.report.scene3d import ERROR_LIMIT, drawn_cameras, most_kept, scene_data
 from freegeo.types import PhotoLike
@@ -69,19 +70,15 @@ def write_report(
 
 
 def render(result: Result, pairs: Sequence[PairPicture] = (), photos: Sequence[PhotoLike] | None = None) -> str:
-    """The page as text; the template engine escapes values such as names of photos."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    """Return the page as text."""
     from markupsafe import Markup
 
-    environment = Environment(
-        loader=PackageLoader("freegeo.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True,
-    )  # fmt: skip
     curve = result.adaptation.get("loss_curve") or []
     course, numbers = sequence.course(result), sequence.view_numbers(result)
     # The trajectory shows the cameras already, unless there are others to compare them with.
     with_plan = result.has_cameras and (course is None or len(result.stages) > 1)
-    return environment.get_template(TEMPLATE).render(
+    return fill(
+        TEMPLATE,
         title=sequence.title(result),
         facts=facts(result),
         answer=answer(result.summary),
@@ -164,7 +161,7 @@ def facts(result: Result) -> list[tuple[str, str]]:
     if summary.get("loss"):
         found.append(("loss", f"{summary['loss']['first']:.4f} → {summary['loss']['last']:.4f}"))
     if summary.get("seconds"):
-        found.append(("time", _duration(sum(summary["seconds"].values()))))
+        found.append(("time", duration(sum(summary["seconds"].values()))))
     found.append(("licence of the weights", summary.get("licence_of_weights") or "not stated in this folder"))
     return found
 
@@ -307,9 +304,3 @@ def flattened(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
 
 def _percent(share: float, digits: int = 1) -> str:
     return f"{100 * float(share):.{digits}f} %"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
