@@ -14,13 +14,16 @@ from exact_rooms import room
 from example_results import HOSTILE_NAME, finer_photos, write_example
 from example_sequences import ring
 from freegeo import files
+from freegeo.data.photos import MemoryPhoto
 from freegeo.export.colours import INVALID_GREY, log_colours, log_range
+from freegeo.export.formats import export
 from freegeo.export.kept import save_kept
 from freegeo.export.reconstruction import METRIC_MODEL, Reconstruction, Scale
 from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
-from freegeo.job import write_files
+from freegeo.job import before_adaptation, write_files
 from freegeo.report import figures, page, scene3d
+from freegeo.report.contents import FILES, contents
 from freegeo.report.page import flattened, score_table, views, write_report
 from freegeo.report.rendering import marked
 from freegeo.report.result import load_result
@@ -146,6 +149,24 @@ def test_a_frozen_prediction_beside_known_cameras_is_called_what_it_is(tmp_path)
     assert "what differs from it is not the adaptation alone" in text
     assert "adapted, from frozen, own cameras" in text
     assert "4 poses, 4 intrinsics, positions times 2.5" in text
+    for facts, label in (
+        ({"known_cameras": known}, "frozen, own cameras"),
+        ({"one_camera": {}}, "frozen"),
+        ({}, "frozen"),
+    ):
+        shown = before_adaptation(folder, {"known_cameras": None, "one_camera": None, **facts})
+        assert shown.label == label, "in the fly-through as in the report"
+
+
+def test_the_list_of_files_stays_true_when_depth_of_another_size_is_exported(tmp_path):
+    folder = write_example(tmp_path / "out", truth=False)
+    result = Reconstruction.load(folder)
+    photos = [MemoryPhoto(n, np.zeros((*hw, 3), np.uint8)) for n, hw in zip(result.names, result.photo_hw, strict=True)]
+    for size in ("photo", "model"):
+        export(result, folder, ["depth"], photos=photos, depth_size=size)
+        assert ("interpolated" in contents(folder)["depth"]) == (size == "photo")
+        assert "interpolated" not in FILES["depth"]
+        assert ("depth", "depth/", FILES["depth"]) in page.files_beside(folder)
 
 
 def test_report_viewer_and_files_have_the_same_points(tmp_path):

@@ -453,7 +453,7 @@ def describe(summary: dict[str, Any], folder: Path) -> None:
     console.say(f"licence of the weights: {summary['licence_of_weights']}")
     for sentence in summary["warnings"]:
         console.say(f"warning: {sentence}")
-    console.written(folder, contents(depth_size=summary["settings"].get("depth_size")))
+    console.written(folder, contents(folder))
 
 
 def say_known(summary: dict[str, Any]) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.export.base import Export, Format
+from freegeo.export.base import DepthSize, Export, Format
 from freegeo.export.colours import DEPTH_MAP, colour_table, log_colours, log_range
 from freegeo.export.photos import check_names, new_names, pixels_of
 from freegeo.export.reconstruction import Reconstruction
@@ -29,12 +29,14 @@ from freegeo.export.reconstruction import Reconstruction
 logger = logging.getLogger(__name__)
 
 LARGEST = 65535
+SIDECAR = "depth.json"
+"""File beside the maps that says what their values mean."""
 CHANNEL = "Y"
 """Channel of the EXR files: luminance, which OpenCV and Blender read as one grey image."""
 _LIMITS = "Filters of points (confidence, flying pixels, other views) are not applied."
 _NOTHING = "no valid depth, or outside the masks."
 _VALUES = f"depth along the optical axis; 0: {_NOTHING} {_LIMITS}"
-_SIZES = {
+_SIZES: dict[DepthSize, str] = {
     "model": "that of the model's images",
     "photo": "that of the photos, interpolated from the model's along the edges of the photo",
 }
@@ -74,6 +76,15 @@ def photo_depth(export: Export, view: int, known: np.ndarray) -> np.ndarray:
     return upsampled_depth(r.depth_z[view], known, r.images[view], photo, r.scale_xy[view], r.offset_xy[view])
 
 
+def size_of(folder: Path) -> DepthSize | None:
+    """Return the size of the depth files in a folder, as they say themselves; None where that cannot be read."""
+    try:
+        said = files.read_json(folder / SIDECAR)["size"]
+    except (OSError, FreeGeoError, TypeError, KeyError):
+        return None
+    return next((size for size in _SIZES if _SIZES[size] == said), None)
+
+
 def depth_names(names: Sequence[str], suffix: str = ".png") -> list[str]:
     """File names of the maps: the photos' with the suffix, added to the old one where photos differ in it only."""
     return new_names(names, [suffix] * len(names))
@@ -94,7 +105,7 @@ def _write_maps(
     place, r, size = export.folder / folder, export.reconstruction, _SIZES[export.depth_size]
     maps = dict(zip(r.names, depth_names(r.names, suffix), strict=True))
     said = json.dumps({**about, "lengths": r.lengths, "size": size, "maps": maps}, indent=2, ensure_ascii=False)
-    texts = {"depth.json": f"{said}\n", **(more or {})}
+    texts = {SIDECAR: f"{said}\n", **(more or {})}
     names = [*maps.values(), *texts]
     with files.atomic_files(place, names) as paths:
         for path, depth in zip(paths, depth_maps(export), strict=False):

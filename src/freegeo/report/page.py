@@ -13,7 +13,7 @@ from freegeo.export.colours import DEPTH_MAP, log_colours, log_range
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.report import figures, sequence
 from freegeo.report.answer import HEADER, NOTE, answer, rescaled
-from freegeo.report.contents import contents
+from freegeo.report.contents import FILES
 from freegeo.report.pairs import PairPicture, pair_pictures
 from freegeo.report.rendering import duration, fill
 from freegeo.report.result import LABELS, MANY_VIEWS, REPORT_NAME, Result, camera_difference, even_choice, load_result
@@ -119,7 +119,7 @@ def render(result: Result, pairs: Sequence[PairPicture] = (), photos: Sequence[P
         adaptation=list(flattened({k: v for k, v in result.adaptation.items() if k not in ("loss_curve", "recipe")})),
         versions=list((result.summary.get("versions") or {}).items()),
         command=result.summary.get("command"),
-        files=list(files_beside(result.folder, (result.summary.get("settings") or {}).get("depth_size"))),
+        files=list(files_beside(result.folder)),
     )
 
 
@@ -133,9 +133,12 @@ def unasked(result: Result) -> str:
     return "The model's own prediction: neither adapted to these photos nor refined."
 
 
-def files_beside(folder: Path, depth_size: str | None) -> Iterator[tuple[str, str, str]]:
-    """Files of a result that exist: name, address relative to the page, purpose."""
-    for name, about in contents(depth_size=depth_size).items():
+def files_beside(folder: Path) -> Iterator[tuple[str, str, str]]:
+    """Files of a result that exist: name, address relative to the page, purpose.
+
+    A later export may write depth files of another size beside this page, so nothing is said of it.
+    """
+    for name, about in FILES.items():
         path = folder / name
         if name != REPORT_NAME and path.exists():
             yield name, f"{name}/" if path.is_dir() else name, about

@@ -156,9 +156,10 @@ def files(run: Run) -> Iterator[dict[str, str]]:
     """Give name, size and purpose of the files of a result that can be fetched one by one."""
     order = [REPORT_NAME, *(FORMATS[name].path for name in DEFAULT_FORMATS)]
     there = [path for path in run.result.iterdir() if path.is_file() and not path.name.startswith(".")]
+    about = contents(run.result)
     rank = {name: number for number, name in enumerate(order)}
     for path in sorted(there, key=lambda path: (rank.get(path.name, len(rank)), path.name)):
-        yield {"name": path.name, "size": size_text(path.stat().st_size), "about": contents().get(path.name, "")}
+        yield {"name": path.name, "size": size_text(path.stat().st_size), "about": about.get(path.name, "")}
 
 
 def capital(sentence: str) -> str:
