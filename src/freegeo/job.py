@@ -175,8 +175,8 @@ class Job:
     masks: list[np.ndarray] | None = None
     """One (H, W) array per photo at its size, not zero where points are wanted."""
     hooks: Hooks = field(default_factory=Hooks)
-    checkpoint: Mapping[str, str] | None = None
-    """File name and fingerprint of the weights, for reconstruction.json."""
+    checkpoint: Mapping[str, Any] | None = None
+    """Which weights the model has, for reconstruction.json (`LoadedFrom.weights`)."""
     command: str | None = None
     """The command line, for reconstruction.json."""
     warnings: list[str] = field(default_factory=list)

@@ -272,7 +272,7 @@ def test_the_page_shows_the_points_that_the_command_kept(tmp_path):
     shape = load_result(folder).final.keep.shape
     keep = np.zeros(shape, dtype=bool)
     keep[:, :5] = True
-    report = FilterReport(pixels=keep.size, removed={"mask": int((~keep).sum()), "sky": 0}, tolerance=None)
+    report = FilterReport(pixels=keep.size, removed={"mask": int((~keep).sum()), "sky or ambiguous": 0}, tolerance=None)
     save_kept(folder, (keep, report))
     result = load_result(folder)
     assert np.array_equal(result.final.keep, keep)

@@ -171,7 +171,7 @@ def run_job(
             load=model_options.load, spec=empty.spec, folder=folder, recipe=plan, adapter=adapter, guard=guard,
             seed=model_options.seed, compute=model_options.compute(), hooks=hooks, reference=model_options.reference,
             command=console.command_line(), warnings=console.warned(), after=after, formats=formats,
-            depth_size=depth_size, filters=files.filters.settings(), checkpoint=model_options.checkpoint_identity,
+            depth_size=depth_size, filters=files.filters.settings(), checkpoint=model_options.origin(),
             refine=refining, pose_from=pose_from, photos=found.photos, batch=found.batch, masks=found.masks,
             known=found.known, priors=found.priors, one_camera=found.one_camera, scale=found.scale,
         )  # fmt: skip

@@ -39,7 +39,7 @@ SCORE_LABELS = {
 FILTER_TEXTS = {
     "invalid depth": "no usable depth",
     "mask": "outside the user's masks",
-    "sky": "sky",
+    "sky or ambiguous": "sky, or pixels that the model calls ambiguous",
     "confidence": "least confident share",
     "flying": "between surfaces (flying pixels)",
     "multi-view": "contradicted by other views",
