@@ -146,8 +146,17 @@ class _LostPhoto(MemoryPhoto):
         return super().read()
 
 
-@pytest.mark.parametrize("error", [UserError, KeyboardInterrupt])
-@pytest.mark.parametrize(("format", "reads"), [("nerfstudio", 1), ("nerfstudio", 3), ("depth", 1), ("depth-color", 1)])
+@pytest.mark.parametrize(
+    ("format", "reads", "error"),
+    [
+        ("nerfstudio", 1, KeyboardInterrupt),
+        ("nerfstudio", 3, KeyboardInterrupt),
+        ("nerfstudio", 3, UserError),
+        ("depth", 1, KeyboardInterrupt),
+        ("depth", 1, UserError),
+        ("depth-color", 1, KeyboardInterrupt),
+    ],
+)
 def test_a_format_that_stops_half_way_leaves_nothing_half_written(tmp_path, format, reads, error):
     scene, nearer = room(2, (24, 32)), replace(room(2, (24, 32)), depth_z=room(2, (24, 32)).depth_z / 2)
     options = {"masks": np.ones(scene.depth_z.shape, bool), "depth_size": "photo"}

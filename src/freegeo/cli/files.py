@@ -127,7 +127,7 @@ class FileOptions:
         if self.filters.masks is None:
             for folder in unused_masks(photos):
                 logger.warning(
-                    "%s holds images that are not used; if these are the masks of the photos, add --masks %s.",
+                    "%s holds images that are not used; if these are the masks of the photos, add `--masks %s`.",
                     folder, shlex.quote(str(folder)),
                 )  # fmt: skip
         return self.filters.load_masks([photo.name for photo in photos], [photo.size_hw for photo in photos])
