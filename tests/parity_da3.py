@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from fixture_tools import DEVICE, read_tensors, relative_error
+from fixture_tools import DEVICE, read_tensors, recorded_cases, relative_error
 from freegeo.geometry.se3 import to_4x4
 from freegeo.models import reference
 from freegeo.models.catalog import build_empty, entry
@@ -37,15 +37,8 @@ Check = Callable[[], float]
 
 def cases(folder: Path) -> Iterator[tuple[str, Check]]:
     """Name and check of every network case, function case and key list in `folder`."""
-    for model in (*ANY_VIEW, SINGLE_VIEW, NESTED):
-        config, check = folder / model / "config.json", NETWORKS.get(model, check_network)
-        for case in json.loads(config.read_text())["cases"] if config.is_file() else ():
-            if (folder / model / case["file"]).is_file():
-                yield f"{model}.{case['name']}", lambda model=model, case=case, check=check: check(folder / model, case)
-    for name, check in FUNCTIONS.items():
-        path = folder / "functions" / name
-        if path.is_file():
-            yield f"functions.{path.stem}", lambda check=check, path=path: check(path)
+    networks = {model: NETWORKS.get(model, check_network) for model in (*ANY_VIEW, SINGLE_VIEW, NESTED)}
+    yield from recorded_cases(folder, networks, FUNCTIONS)
     for preset in KEY_LISTS:
         path = folder / f"keys-{preset}.json"
         if path.is_file():

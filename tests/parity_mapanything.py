@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from fixture_tools import DEVICE, read_tensors, relative_error
+from fixture_tools import DEVICE, read_tensors, recorded_cases, relative_error
 from freegeo.geometry.rotation import matrix_to_quat_xyzw
 from freegeo.geometry.se3 import inverse
 from freegeo.models.catalog import build_empty
@@ -36,19 +36,7 @@ Check = Callable[[], float]
 
 def cases(folder: Path) -> Iterator[tuple[str, Check]]:
     """Name and check of every network case, gradient, function case and the key list in `folder`."""
-    for model in MODELS:
-        config = folder / model / "config.json"
-        for case in json.loads(config.read_text())["cases"] if config.is_file() else ():
-            if (folder / model / case["file"]).is_file():
-                yield f"{model}.{case['name']}", lambda model=model, case=case: check_network(folder / model, case)
-        for path in sorted((folder / model).glob("grad-*.safetensors")):
-            for recompute in (False, True):
-                name = f"{model}.{path.stem}{'.recompute' if recompute else ''}"
-                yield name, lambda path=path, recompute=recompute: check_gradients(path, recompute)
-    for name, check in FUNCTIONS.items():
-        path = folder / "functions" / name
-        if path.is_file():
-            yield f"functions.{path.stem}", lambda check=check, path=path: check(path)
+    yield from recorded_cases(folder, dict.fromkeys(MODELS, check_network), FUNCTIONS, check_gradients)
     if (folder / KEY_LIST).is_file():
         yield "keys.map-anything", lambda: check_keys(folder / KEY_LIST)
 

@@ -51,7 +51,7 @@ def test_a_file_that_unpacks_to_more_than_the_free_memory_is_refused_by_its_head
     path = npz(tmp_path / "a.npz", {"x": npy(np.zeros((1000, 1000), np.float32)), "y": npy(np.ones(3))})
     assert path.stat().st_size < 20_000
     monkeypatch.setattr(files, "host_available", lambda: 3_900_000)
-    with pytest.raises(FreeGeoError, match=r"a\.npz: unpacks to 0\.0 GB, and 0\.0 GB of memory are free"):
+    with pytest.raises(FreeGeoError, match=r"a\.npz: unpacks to 4\.0 MB, and 3\.9 MB of memory are free"):
         files.read_npz(path)
     assert files.read_npz(path, {"y": ("f", (-1,))})["y"].tolist() == [1, 1, 1]
 

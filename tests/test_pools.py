@@ -1,6 +1,7 @@
 """Work that is spread over processes: its outcomes, deaths of workers, and the end."""
 
 import os
+import subprocess
 import sys
 import time
 from itertools import pairwise
@@ -79,6 +80,50 @@ def test_as_many_run_at_once_as_there_are_environments_each_in_its_own(tmp_path)
     assert set(runs) == {"0", "1"}
     for spans in map(sorted, runs.values()):
         assert all(end <= start for (_, end), (start, _) in pairwise(spans))
+
+
+@needs_proc
+def test_processes_of_a_pool_whose_own_process_is_killed_save_their_state_and_end(tmp_path):
+    child = (
+        "import os, signal, sys, time\n"
+        "from freegeo.host import end_with_parent\n"
+        "signal.signal(signal.SIGTERM, lambda *_: (print('saved', flush=True), sys.exit(143)))\n"
+        "end_with_parent()\n"
+        "print(os.getpid(), flush=True)\n"
+        "time.sleep(60)"
+    )
+    parent = (
+        "import sys\nfrom pathlib import Path\nfrom freegeo.pools import ProcessPool, outcomes\n"
+        f"pool = ProcessPool(lambda item, again: [sys.executable, '-c', {child!r}], Path, [{{}}, {{}}])\n"
+        "list(outcomes(pool, sys.argv[1:]))"
+    )
+    logs = [tmp_path / name for name in "ab"]
+
+    def wait_for(words: int):
+        deadline = time.monotonic() + 30
+        while not all(log.is_file() and len(log.read_text().split()) == words for log in logs):
+            assert time.monotonic() < deadline, [log.read_text() for log in logs if log.is_file()]
+            time.sleep(0.02)
+        return [log.read_text().split() for log in logs]
+
+    with subprocess.Popen([sys.executable, "-c", parent, *map(str, logs)]) as process:
+        pids = [int(pid) for (pid,) in wait_for(1)]
+        time.sleep(0.3)
+        assert all(Path(f"/proc/{pid}").exists() for pid in pids), "they go on while it lives"
+        process.kill()
+    assert [said for _, said in wait_for(2)] == ["saved"] * 2
+    deadline = time.monotonic() + 10
+    while any(state(pid) != "Z" for pid in pids):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def state(pid: int) -> str:
+    """The letter that says what a process does, Z once it has ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return "Z"
 
 
 @needs_proc

@@ -24,7 +24,7 @@ from tokenize import TokenError
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from freegeo.errors import DamagedError, FreeGeoError, UserError
-from freegeo.host import host_available
+from freegeo.host import gigabytes, host_available
 from freegeo.lock import LOCK_FILE, Lock, note_removed, note_written, require_lock, require_no_link
 
 if TYPE_CHECKING:
@@ -96,6 +96,20 @@ def atomic_folder(path: Path) -> Generator[Path]:
             (path / name).parent.mkdir(parents=True, exist_ok=True)
             (part / name).replace(path / name)
             note_written(path / name)
+
+
+@contextmanager
+def atomic_files(folder: Path, names: Sequence[str]) -> Generator[list[Path]]:
+    """Give a temporary path for each name of a file below a folder; they become its files together (`atomic_folder`).
+
+    UserError for a name that cannot be a file below a folder; other errors as `atomic_path`.
+    """
+    final = [inside(folder, name) for name in names]
+    with atomic_folder(folder) as part:
+        paths = [part / path.relative_to(folder) for path in final]
+        for path in paths:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        yield paths
 
 
 @contextmanager
@@ -528,7 +542,7 @@ def _require_room(path: Path, sizes: Iterable[int]) -> None:
     needed, free = sum(sizes), host_available()
     if needed > free:
         raise FreeGeoError(
-            f"{path}: unpacks to {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB of memory are free. Close other "
+            f"{path}: unpacks to {gigabytes(needed)}, and {gigabytes(free)} of memory are free. Close other "
             "programs, or use another machine; if the file is not that of a large result, remove it."
         )
 

@@ -1,17 +1,38 @@
-"""What the machine leaves this process: main memory, within its control group, and its answers to signals."""
+"""The machine: the main memory it leaves this process, answers to its signals, and numbers of bytes as text."""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import threading
+import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
+PARENT_VARIABLE = "FREEGEO_END_WITH_PARENT"
+"""Environment variable of a process whose standard input closes when the process that started it is gone."""
+GRACE_S = 20.0
+"""Seconds that a process has to save its state when it is asked to end, before it is ended."""
 _UNLIMITED = 1 << 60
 """Limits of a control group from here on mean that there is none."""
+
+
+def size_text(count: float) -> str:
+    """Return the size of a file in bytes as text: 512 B, 3.4 kB, 20.0 MB, 1.5 GB."""
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.1f} GB"
+
+
+def gigabytes(count: float) -> str:
+    """Return bytes of memory, of a disk or of a download as text: in GB from .05 GB on, else as `size_text`."""
+    return f"{count / 1e9:.1f} GB" if count >= 5e7 else size_text(count)
 
 
 def host_available() -> int:
@@ -61,6 +82,33 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError:
         return ""
+
+
+def bound_to_this_process() -> dict[str, Any]:
+    """Return arguments of `subprocess.Popen` for a freegeo command that ends when this process is gone.
+
+    Its standard input is a pipe that nothing is written to and that this process holds open: the system closes it
+    however this process ends, and `end_with_parent` in the command notices.
+    """
+    return {"stdin": subprocess.PIPE, "env": {**os.environ, PARENT_VARIABLE: "1"}}
+
+
+def end_with_parent() -> None:
+    """Ask this process to end, as SIGTERM does, when the one that started it with `bound_to_this_process` is gone.
+
+    It is ended after `GRACE_S` seconds if it does not do so itself. Nothing happens in a process started otherwise.
+    """
+    if os.environ.pop(PARENT_VARIABLE, None) is not None:
+        threading.Thread(target=_wait_for_parent, daemon=True).start()
+
+
+def _wait_for_parent() -> None:
+    # Not through sys.stdin, whose lock would stop the interpreter at its end.
+    while os.read(0, 1):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(GRACE_S)
+    os._exit(128 + signal.SIGTERM)
 
 
 @contextmanager

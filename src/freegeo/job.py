@@ -65,6 +65,7 @@ from freegeo.posed import (
 )
 from freegeo.refined import refine_by_photos
 from freegeo.report.page import write_report
+from freegeo.report.result import has_other_cameras, stage_label
 from freegeo.run_folder import Part, RunFolder
 from freegeo.types import ImageBatch, PhotoLike, Priors
 
@@ -174,8 +175,8 @@ class Job:
     masks: list[np.ndarray] | None = None
     """One (H, W) array per photo at its size, not zero where points are wanted."""
     hooks: Hooks = field(default_factory=Hooks)
-    checkpoint: Mapping[str, str] | None = None
-    """File name and fingerprint of the weights, for reconstruction.json."""
+    checkpoint: Mapping[str, Any] | None = None
+    """Which weights the model has, for reconstruction.json (`LoadedFrom.weights`)."""
     command: str | None = None
     """The command line, for reconstruction.json."""
     warnings: list[str] = field(default_factory=list)
@@ -459,7 +460,8 @@ class Job:
     def _export(self, found: Computed) -> tuple[FilterReport | None, Mapping[str, str]]:
         """Filter each reconstruction once and write all formats; returns as `write_files`."""
         final = found.result
-        before = before_adaptation(self.folder.path, self._refinement()) if found.adaptation.used else None
+        about = {**found.about, "refinement": self._refinement()}
+        before = before_adaptation(self.folder.path, about) if found.adaptation.used else None
         with self._timed(FILES_STAGE, FILTERS):
             masks = None if self.masks is None else masks_for_model(final, self.masks)
             return write_files(
@@ -538,15 +540,16 @@ class Job:
         self.folder.note(part.name, {**noted, "seconds": seconds})
 
 
-def before_adaptation(folder: Path, refinement: Mapping[str, Any] | None) -> Before | None:
+def before_adaptation(folder: Path, summary: Mapping[str, Any]) -> Before | None:
     """Return the frozen model's prediction in the folder of an adapted result; None where there is none.
 
-    `refinement` is what reconstruction.json says of it.
+    `summary` is what reconstruction.json says, of which refinement and cameras count.
     """
     if not (folder / FROZEN_FOLDER / PREDICTION_NAME).is_file():
         return None
-    refined = bool((refinement or {}).get("accepted"))
-    return Before(folder=folder / FROZEN_FOLDER, result_label="refined" if refined else "adapted")
+    refined = bool((summary.get("refinement") or {}).get("accepted"))
+    label = stage_label("frozen", own_cameras=has_other_cameras(summary))
+    return Before(folder=folder / FROZEN_FOLDER, label=label, result_label="refined" if refined else "adapted")
 
 
 def write_files(

@@ -23,6 +23,7 @@ from typing import Any, Protocol, Self, TypeVar
 
 from freegeo import __version__
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.host import GRACE_S, bound_to_this_process
 
 logger = logging.getLogger(__name__)
 
@@ -31,9 +32,6 @@ RETRIES = 2
 """How often an item is started again after its worker died."""
 POLL_S = 0.1
 """Seconds between two looks at what has ended."""
-GRACE_S = 20.0
-"""Seconds that a process has to save its state when its pool is closed, before it is killed."""
-
 REACH_S = 10.0
 """Seconds in which a ray cluster has to answer."""
 
@@ -87,7 +85,8 @@ class ProcessPool:
     """Commands in processes of this machine; the outcome of an item is the exit code of its command.
 
     Used as a context, it stops the processes that are left at the end: they are asked to end, and killed after
-    `GRACE_S` seconds.
+    `GRACE_S` seconds. Those of freegeo commands end by themselves when this process is killed
+    (`freegeo.host.end_with_parent`).
 
     Args:
         command: the command line of an item; its second argument says whether its process died before.
@@ -121,6 +120,7 @@ class ProcessPool:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+            _close(process)
 
     def start(self, item: Any, *, again: bool) -> None:
         """Carry out an item as soon as there is room."""
@@ -134,19 +134,27 @@ class ProcessPool:
         time.sleep(POLL_S)
         over = [one for one in self._running if one[0].poll() is not None]
         self._running = [one for one in self._running if one not in over]
+        for process, _, _ in over:
+            _close(process)
         self._free.extend(environment for _, _, environment in over)
         return [(item, _exit(process.returncode)) for process, item, _ in over]
 
     def _launch(self, item: Any, again: bool) -> None:
-        environment = self._free.popleft()
+        environment, bound = self._free.popleft(), bound_to_this_process()
         with self._log(item).open("ab") as log:
             process = subprocess.Popen(
-                self._command(item, again), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
-                env={**os.environ, **environment},
+                self._command(item, again), stdin=bound["stdin"], stdout=log, stderr=subprocess.STDOUT,
+                env={**bound["env"], **environment},
                 # Ctrl-C reaches this process alone, which stops the others.
                 process_group=0,
             )  # fmt: skip
         self._running.append((process, item, environment))
+
+
+def _close(process: subprocess.Popen) -> None:
+    """Close the pipe by which an ended process would have noticed the end of this one."""
+    if process.stdin is not None:
+        process.stdin.close()
 
 
 def _exit(code: int) -> int | Died:

@@ -31,6 +31,7 @@ from freegeo.export.photos import write_copies
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.files import read_json
 from freegeo.fusion.settings import FilterSettings
+from freegeo.host import gigabytes
 from freegeo.job import MATCHES_NAME, PARTS, SUMMARY_NAME, Hooks, Job
 from freegeo.metres import read_scale, require_in_view
 from freegeo.models.checkpoints import fingerprint
@@ -269,11 +270,10 @@ def _say_plan(chunks: Plan, model: ReconstructionModel, batch: ImageBatch, compu
     count = len(plan_chunks(len(batch), chunks.size, chunks.overlap))
     parts, _ = plan_reconstruction(model, min(chunks.size, len(batch)), batch.image_hw, compute=compute)
     peak = sum(size for _, size in parts)
-    memory = f"{peak / 1e9:.1f} GB" if peak >= 1e8 else f"{peak / 1e6:.0f} MB"
     logger.info(
         "%d photos in %d chunks of %d, neighbours share %d: about %s of memory at a time; the time is measured on "
         "the first chunk",
-        len(batch), count, chunks.size, chunks.overlap, memory,
+        len(batch), count, chunks.size, chunks.overlap, gigabytes(peak),
     )  # fmt: skip
 
 
@@ -571,7 +571,7 @@ def reconstruct_sequence(
                 spec=model.spec, recipe=plan, adapter=saved, guard=guard, seed=seed, compute=compute,
                 hooks=Hooks(stage=_said if progress else lambda stage: None, step=on_step), reference=reference,
                 warnings=warned, formats=written, filters=points, refine=refine, pose_from=pose_from,
-                checkpoint=_checkpoint(model),
+                checkpoint=None if model.loaded_from is None else model.loaded_from.weights(),
             )  # fmt: skip
     pieces = [part["folder"] for part in summary["sequence"]["pieces"]] if "sequence" in summary else ["."]
     return SequenceResult(
@@ -592,12 +592,6 @@ def _remembered() -> Generator[list[str]]:
         yield memory.sentences
     finally:
         package.removeHandler(memory)
-
-
-def _checkpoint(model: ReconstructionModel) -> dict[str, str] | None:
-    """Return file name and fingerprint of a model's weights; None for weights that came from no file."""
-    loaded = model.loaded_from
-    return None if loaded is None else {"file": loaded.file, "fingerprint": loaded.fingerprint}
 
 
 def _identity(model: ReconstructionModel, compute: Compute, recipe: Recipe | None, seed: int) -> dict[str, object]:

@@ -70,11 +70,15 @@ def test_saving_twice_writes_the_same_tensors(build, tmp_path):
 
 def test_the_page_says_what_the_adapter_is(build, tmp_path):
     model = build()
-    model.loaded_from = LoadedFrom(model=model.spec.name, file="model.safetensors", fingerprint="0123", licence="none")
+    weights = {
+        "file": "model.safetensors", "fingerprint": "0123", "sha256": {"model.safetensors": "4567"},
+        "hub_id": "somebody/model", "revision": "89ab",
+    }  # fmt: skip
+    model.loaded_from = LoadedFrom(model=model.spec.name, licence="none", **weights)
     files = save_adapter(attach(model), tmp_path, METADATA)
     metadata = adapter_metadata(tmp_path)
     assert metadata == {
-        "format": 1, "base": {"model": model.spec.name, "fingerprint": "0123", "licence": "none"},
+        "format": 1, "base": {"model": model.spec.name, **weights, "licence": "none"},
         "strength": 1.0, **METADATA,
     }  # fmt: skip
     assert sorted(tmp_path.iterdir()) == sorted(files)

@@ -224,7 +224,7 @@ def test_the_plan_is_said_in_one_line_and_its_parts_to_those_who_ask(caplog, mon
 def test_every_run_plans_with_what_is_free(monkeypatch):
     monkeypatch.setattr(memory, "available", lambda device, model: 1_000_000)
     model = tiny_da3()
-    with pytest.raises(UserError, match="GB are free"):
+    with pytest.raises(UserError, match="MB are free"):
         adapt(model, [images(9, 32)], scene(model.spec), seed=0)
 
 

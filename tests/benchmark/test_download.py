@@ -18,6 +18,7 @@ from fixture_tools import fixture_path
 from freegeo.benchmark import download
 from freegeo.cli.app import main
 from freegeo.data.datasets import eth3d
+from freegeo.host import gigabytes
 
 DATASETS = fixture_path("benchmark", "datasets")
 
@@ -75,7 +76,7 @@ def get(capsys, tmp_path, hub):
 def test_a_dataset_is_shown_fetched_checked_and_unpacked(get, hub, tmp_path):
     code, out, _ = get("eth3d")
     assert code == 0
-    size = download.gigabytes(len(ARCHIVE))
+    size = gigabytes(len(ARCHIVE))
     assert f"eth3d: eth3d.zip, {size}" in out
     assert "terms: research only, under the terms of ETH3D: https://www.eth3d.net" in out
     assert "source: https://huggingface.co/datasets/depth-anything/DA3-BENCH" in out
@@ -277,7 +278,7 @@ def test_a_disk_that_is_too_small_or_becomes_full(get, hub, monkeypatch, tmp_pat
     (tmp_path / "data" / "eth3d.zip").write_bytes(ARCHIVE)
     code, _, said = get("eth3d")
     assert code == 2, said
-    assert re.search(r"eth3d.zip unpacks to .* MB, and .* MB are free", said)
+    assert re.search(r"eth3d.zip unpacks to .* kB, and .* kB are free", said)
     monkeypatch.setattr(download, "free_bytes", plain)
     monkeypatch.setattr(Path, "mkdir", full_below("eth3d/pipes", Path.mkdir))
     code, _, said = get("eth3d")

@@ -23,6 +23,7 @@ from freegeo.adaptation.state import UNFINISHED_FILE
 from freegeo.export import formats
 from freegeo.files import LEDGER_FILE, RUN_FILE
 from freegeo.lock import LOCK_FILE
+from freegeo.models.hub import sha256_of
 
 ADAPTER_FILES = {"adapter_config.json", "adapter_model.safetensors", "camera_token.safetensors", "freegeo.json"}
 RESULT_FILES = {"reconstruction.json", "prediction.npz", "kept.npz", "points.ply", "scene.glb"}
@@ -110,7 +111,8 @@ def test_summary_says_how_the_result_came_about(finished, weights):
     assert all(seconds >= 0 for seconds in summary["seconds"].values())
     metadata = json.loads((finished / "adapter" / "freegeo.json").read_text())
     assert metadata["base"]["model"] == "freegeo-tiny"
-    assert metadata["base"]["fingerprint"] == summary["checkpoint"]["fingerprint"]
+    assert summary["checkpoint"]["sha256"] == {weights.name: sha256_of(weights)}
+    assert metadata["base"] == {**metadata["base"], **summary["checkpoint"]}
     assert [set(step) >= {"total"} for step in metadata["loss_curve"]] == [True, True]
     assert load_file(finished / "adapter" / "camera_token.safetensors")
 

@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from freegeo.cli.files import FileOptions, FilterOptions
 from freegeo.data import image_files
 from freegeo.data.image_files import MAX_PIXELS
 from freegeo.data.photos import MemoryPhoto, evenly_spaced, load_photos, natural_key, unique_names
@@ -458,6 +459,18 @@ def test_photos_in_sub_folders_of_a_folder_of_photos_are_named(tmp_path, caplog)
     caplog.clear()
     assert names(f"{tmp_path}/*") == ["a.png"]
     assert caplog.text == "", "a pattern says what it is about"
+
+
+def test_masks_beside_the_photos_are_not_taken_for_photos_but_named_where_they_are_not_used(tmp_path, caplog):
+    for name in ("a.png", "b.png", "masks/a.png", "masks/b.png"):
+        save(tmp_path / name, format="PNG", pixels=np.full((24, 32, 3), 255, np.uint8))
+    photos = load_photos(tmp_path)
+    assert [photo.name for photo in photos] == ["a.png", "b.png"]
+    assert "sub-folders" not in caplog.text
+    FileOptions(filters=FilterOptions(masks=tmp_path / "masks")).checked_masks(photos)
+    assert "masks holds images" not in caplog.text
+    assert FileOptions().checked_masks(photos) is None
+    assert f"{tmp_path}/masks holds images that are not used" in caplog.text
 
 
 def test_videos_in_place_of_photos(tmp_path):

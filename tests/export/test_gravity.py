@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from exact_rooms import cloud_of, room
 from freegeo.export.formats import export
-from freegeo.export.glb import UP_UNKNOWN, opencv_to_gltf
+from freegeo.export.glb import NODE, OPENCV_TO_GLTF, UP_UNKNOWN
 from freegeo.export.gravity import find_up, upright_rotation
 from freegeo.fusion.normals import point_normals
 
@@ -44,23 +44,23 @@ def angle_deg(a, b):
 
 
 @pytest.mark.parametrize("seed", [1, 3, 5, 8])
-def test_the_floor_is_level_in_the_glb_file_however_the_world_lies(tmp_path, seed):
+def test_the_floor_is_level_in_the_glb_scene_and_its_vertices_are_those_of_the_other_files(tmp_path, seed):
     R = Rotation.random(rng=seed).as_matrix()
     scene = turned(room(8, seed=seed), R)
     export(scene, tmp_path, ["glb", "ply"])
     loaded = trimesh.load(tmp_path / "scene.glb")
     assert "the normal of a plane" in loaded.metadata["up"]
     points = trimesh.load(tmp_path / "points.ply").vertices
-    level = np.asarray(loaded.geometry["points"].vertices)
-    # Which rotation it is follows from the points themselves.
-    turn, distance = Rotation.align_vectors(level - level.mean(0), points - points.mean(0))
-    assert distance < 1e-4 * len(points) ** 0.5
-    assert angle_deg(turn.as_matrix() @ R @ ROOM_UP, np.array([0, 1, 0])) < 2
-    centres = np.linalg.inv(scene.T_cam_world)[:, :3, 3] @ turn.as_matrix().T
-    for view, centre in enumerate(centres):
-        corners = np.asarray(loaded.geometry[f"camera_{view:03d}"].vertices)
-        assert np.linalg.norm(corners - centre, axis=1).min() < 0.02, "points and frusta are turned together"
-    ahead = turn.as_matrix() @ scene.T_cam_world[0, 2, :3]
+    np.testing.assert_array_equal(loaded.geometry["points"].vertices, points)
+    turn, _ = loaded.graph.get(NODE)
+    np.testing.assert_array_equal(loaded.graph.get("points")[0], turn)
+    assert angle_deg(turn[:3, :3] @ R @ ROOM_UP, np.array([0, 1, 0])) < 2
+    for view, centre in enumerate(np.linalg.inv(scene.T_cam_world)[:, :3, 3]):
+        matrix, name = loaded.graph.get(f"camera_{view:03d}")
+        np.testing.assert_array_equal(matrix, turn)
+        corners = np.asarray(loaded.geometry[name].vertices)
+        assert np.linalg.norm(corners - centre, axis=1).min() < 0.02, "the frustum stands where its camera is"
+    ahead = turn[:3, :3] @ scene.T_cam_world[0, 2, :3]
     assert ahead[2] < 0 and abs(ahead[0]) < 1e-3, "the first camera's heading is -z"
 
 
@@ -93,8 +93,7 @@ def test_cameras_that_disagree_leave_the_world_as_it_is(tmp_path, caplog):
     loaded = trimesh.load(tmp_path / "scene.glb")
     assert loaded.metadata["up"] == UP_UNKNOWN
     assert f"scene.glb: up is {UP_UNKNOWN}" in caplog.text
-    points = trimesh.load(tmp_path / "points.ply").vertices
-    np.testing.assert_allclose(loaded.geometry["points"].vertices, opencv_to_gltf(points), atol=1e-6)
+    np.testing.assert_array_equal(loaded.graph.get("points")[0][:3, :3], OPENCV_TO_GLTF)
     assert up_of(rolled(room(2), (0, 1))) is None, "one against one"
 
 

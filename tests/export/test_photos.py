@@ -15,6 +15,7 @@ from freegeo.data.photos import MemoryPhoto, Photo, load_photos
 from freegeo.errors import UserError
 from freegeo.export.formats import export
 from freegeo.export.photos import copy_names, own_file, photo_records, write_copies
+from freegeo.files import LEDGER_FILE
 
 LANDSCAPE, PORTRAIT = (96, 128), (128, 96)
 
@@ -123,6 +124,66 @@ def test_a_photo_that_has_gone_is_one_failed_format(tmp_path):
     assert "photo 2.JPG" in result.failed["nerfstudio"]
     assert [file.name for file in result.files] == ["points.ply"]
     assert [record is None for record in photo_records(photos)] == [False, False, True, False]
+
+
+class LostPhotos(list):
+    """Photos in memory that cannot be read any more after some reads."""
+
+    def __init__(self, scene, reads: int, error: type[BaseException]):
+        self.reads, self.error = reads, error
+        super().__init__(_LostPhoto(self, name, hw) for name, hw in zip(scene.names, scene.photo_hw, strict=True))
+
+
+class _LostPhoto(MemoryPhoto):
+    def __init__(self, all_of_them, name, hw):
+        super().__init__(name, np.full((*hw, 3), 9, np.uint8))
+        object.__setattr__(self, "all_of_them", all_of_them)
+
+    def read(self):
+        self.all_of_them.reads -= 1
+        if self.all_of_them.reads < 0:
+            raise self.all_of_them.error("it was moved")
+        return super().read()
+
+
+@pytest.mark.parametrize(
+    ("format", "reads", "error"),
+    [
+        ("nerfstudio", 1, KeyboardInterrupt),
+        ("nerfstudio", 3, KeyboardInterrupt),
+        ("nerfstudio", 3, UserError),
+        ("depth", 1, KeyboardInterrupt),
+        ("depth", 1, UserError),
+        ("depth-color", 1, KeyboardInterrupt),
+    ],
+)
+def test_a_format_that_stops_half_way_leaves_nothing_half_written(tmp_path, format, reads, error):
+    scene, nearer = room(2, (24, 32)), replace(room(2, (24, 32)), depth_z=room(2, (24, 32)).depth_z / 2)
+    options = {"masks": np.ones(scene.depth_z.shape, bool), "depth_size": "photo"}
+
+    def files(folder):
+        return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+    for earlier in (False, True):
+        out = tmp_path / str(earlier)
+        if earlier:
+            export(scene, out, [format], photos=LostPhotos(scene, 99, error), **options)
+        before = files(out)
+        lost = LostPhotos(scene, reads, error)
+        if error is KeyboardInterrupt:
+            with pytest.raises(KeyboardInterrupt):
+                export(nearer, out, [format], photos=lost, **options)
+        else:
+            assert list(export(nearer, out, [format], photos=lost, **options).failed) == [format]
+        after = files(out)
+        assert {name.split("/")[0] for name in after} <= {LEDGER_FILE, "images", "points.ply"} | (
+            {format} if earlier and error is KeyboardInterrupt else set()
+        )
+        assert {name for name in after if name.startswith("images/")} in (
+            {f"images/{name}" for name in scene.names},
+            set(),
+        )
+        assert all(after[name] == before[name] for name in after if name.startswith("depth"))
 
 
 def test_other_photos_than_the_reconstruction_s_are_refused(tmp_path):

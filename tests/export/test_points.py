@@ -7,7 +7,7 @@ import trimesh
 from exact_rooms import cloud_of, room
 from freegeo.data.procedural import sample_rooms
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.export.glb import FRUSTUM_SHARE, frustum_corners, opencv_to_gltf, order_colours, write_glb
+from freegeo.export.glb import FRUSTUM_SHARE, NODE, OPENCV_TO_GLTF, frustum_corners, order_colours, write_glb
 from freegeo.export.ply import write_ply
 from freegeo.fusion.normals import point_normals
 from freegeo.fusion.points import PointCloud
@@ -117,18 +117,13 @@ def test_normals_do_not_reach_over_the_edge_of_a_surface_or_of_the_photo():
     np.testing.assert_array_equal(unknown, 0)
 
 
-def test_gltf_axes():
-    np.testing.assert_array_equal(opencv_to_gltf(np.array([[1.0, 2.0, 3.0]])), [[1.0, -2.0, -3.0]])
-    np.testing.assert_array_equal(opencv_to_gltf(opencv_to_gltf(np.eye(3))), np.eye(3))
-
-
 def test_glb_reopens_with_the_same_points_colours_and_cameras(tmp_path):
     scene = room()
     cloud = cloud_of(scene)
     loaded = trimesh.load(write_scene(scene, cloud, tmp_path / "scene.glb"))
     assert set(loaded.geometry) == {"points", "camera_000", "camera_001", "camera_002", "camera_003"}
     points = loaded.geometry["points"]
-    np.testing.assert_allclose(points.vertices, opencv_to_gltf(cloud.points), rtol=1e-6)
+    np.testing.assert_array_equal(points.vertices, cloud.points)
     np.testing.assert_array_equal(points.colors[:, :3], cloud.colours)
     for view, colour in enumerate(order_colours(4)):
         camera = loaded.geometry[f"camera_{view:03d}"]
@@ -141,8 +136,7 @@ def test_frusta_stand_where_the_cameras_are_and_look_where_they_look(tmp_path):
     loaded = trimesh.load(write_scene(scene, cloud_of(scene), tmp_path / "scene.glb"))
     for view in range(len(scene)):
         T = scene.T_cam_world[view].astype(np.float64)
-        vertices = opencv_to_gltf(np.asarray(loaded.geometry[f"camera_{view:03d}"].vertices))
-        camera = vertices @ T[:3, :3].T + T[:3, 3]
+        camera = np.asarray(loaded.geometry[f"camera_{view:03d}"].vertices) @ T[:3, :3].T + T[:3, 3]
         depth = FRUSTUM_SHARE * np.median(scene.depth_z)
         width = 0.03 * depth
         assert -width < camera[:, 2].min() < width
@@ -162,8 +156,14 @@ def test_a_point_in_front_of_the_first_camera_is_at_minus_z_and_up_is_plus_y(tmp
     K = np.array([[[50, 0, 32], [0, 50, 24], [0, 0, 1]]], np.float32)
     file = write_glb(cloud, np.eye(4, dtype=np.float32)[None], K, (48, 64), tmp_path / "a.glb", lengths="up to scale")
     loaded = trimesh.load(file)
-    np.testing.assert_array_equal(loaded.geometry["points"].vertices, [[0, 0, -2], [0, 1, -2]])
-    assert loaded.geometry["camera_000"].vertices[:, 2].min() < -0.1
+    turn, name = loaded.graph.get("points")
+    np.testing.assert_array_equal(turn[:3, :3], OPENCV_TO_GLTF)
+    np.testing.assert_array_equal(
+        trimesh.transform_points(loaded.geometry[name].vertices, turn), [[0, 0, -2], [0, 1, -2]]
+    )
+    np.testing.assert_array_equal(loaded.graph.get("camera_000")[0], turn)
+    np.testing.assert_array_equal(loaded.graph.get(NODE)[0], turn)
+    assert loaded.geometry["camera_000"].vertices[:, 2].max() > 0.1
 
 
 def test_frustum_corners_are_the_image_corners():

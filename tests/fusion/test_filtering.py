@@ -168,9 +168,9 @@ def test_every_filter_reports_what_it_removed():
     sky = np.zeros(depth_z.shape, np.float32)
     sky[:, :6] = 0.9
     keep, report = filter_pixels(depth_z, conf, T_cam_world, K, sky=sky, masks=masks)
-    assert list(report.removed) == ["invalid depth", "mask", "sky", "confidence", "flying", "multi-view"]
+    assert list(report.removed) == ["invalid depth", "mask", "sky or ambiguous", "confidence", "flying", "multi-view"]
     assert report.removed["mask"] == 3 * 24 * 4
-    assert report.removed["sky"] == 3 * 6 * 28
+    assert report.removed["sky or ambiguous"] == 3 * 6 * 28
     assert report.removed["confidence"] == pytest.approx(0.4 * 3 * 18 * 28, abs=2)
     assert report.pixels - sum(report.removed.values()) == report.kept == keep.sum()
     assert not keep[:, :6].any()

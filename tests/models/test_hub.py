@@ -437,6 +437,25 @@ def test_a_cache_that_takes_no_note_is_read_each_time(online, monkeypatch):
         catalog.download("da3-base")
 
 
+def test_what_was_downloaded_is_named_by_commit_and_hash(online, tmp_path):
+    path = catalog.download("da3-base")
+    digest = hashlib.sha256(CONTENT).hexdigest()
+    found = catalog.origin_of("da3-base").weights()
+    assert (found["hub_id"], found["revision"], found["sha256"]) == (
+        catalog.entry("da3-base").hub_id,
+        COMMIT,
+        {path.name: digest},
+    )
+    local = tmp_path / "mine.safetensors"
+    local.write_bytes(OTHER)
+    (tmp_path / "mine.safetensors.sha256").write_text(f"{digest}  mine.safetensors\n")
+    found = catalog.origin_of("da3-base", local).weights()
+    assert (found["hub_id"], found["revision"]) == (None, None)
+    assert found["sha256"] == {local.name: hashlib.sha256(OTHER).hexdigest()}, (
+        "a note beside a local file is not trusted"
+    )
+
+
 def test_describe_prints_what_to_pin(online, capsys):
     models.describe("da3-base")
     assert "pinned: nothing; " in capsys.readouterr().out

@@ -14,14 +14,18 @@ from exact_rooms import room
 from example_results import HOSTILE_NAME, finer_photos, write_example
 from example_sequences import ring
 from freegeo import files
+from freegeo.data.photos import MemoryPhoto
 from freegeo.export.colours import INVALID_GREY, log_colours, log_range
+from freegeo.export.formats import export
 from freegeo.export.kept import save_kept
 from freegeo.export.reconstruction import METRIC_MODEL, Reconstruction, Scale
 from freegeo.fusion.filtering import FilterReport
 from freegeo.fusion.settings import FilterSettings
-from freegeo.job import write_files
+from freegeo.job import before_adaptation, write_files
 from freegeo.report import figures, page, scene3d
+from freegeo.report.contents import FILES, contents
 from freegeo.report.page import flattened, score_table, views, write_report
+from freegeo.report.rendering import marked
 from freegeo.report.result import load_result
 
 
@@ -59,10 +63,28 @@ def test_warnings_of_the_summary_stand_at_the_top(tmp_path):
     folder = write_example(tmp_path / "out")
     plain = write_report(folder).read_text(encoding="utf-8")
     summary = files.read_json(folder / "reconstruction.json")
-    files.write_json(folder / "reconstruction.json", {**summary, "warnings": ["Half of <b>a.png</b> is cut off."]})
+    files.write_json(
+        folder / "reconstruction.json", {**summary, "warnings": ["Half of <b>a.png</b> is cut off: `freegeo export`."]}
+    )
     page = write_report(folder).read_text(encoding="utf-8")
     assert 'class="warnings"' not in plain
-    assert page.index("Half of &lt;b&gt;a.png&lt;/b&gt; is cut off.") < page.index("<main>")
+    assert page.index("Half of &lt;b&gt;a.png&lt;/b&gt; is cut off: <code>freegeo export</code>.") < page.index(
+        "<main>"
+    )
+
+
+@pytest.mark.parametrize(
+    ("sentence", "shown"),
+    [
+        ("run `freegeo adapt <x>` again", "run <code>freegeo adapt &lt;x&gt;</code> again"),
+        ("`<script>`, `b`", "<code>&lt;script&gt;</code>, <code>b</code>"),
+        ("one ` alone", "one ` alone"),
+        ("``", "``"),
+        ("</code>`a`", "&lt;/code&gt;<code>a</code>"),
+    ],
+)
+def test_what_stands_between_backticks_is_code_and_escaped(sentence, shown):
+    assert marked(sentence) == shown
 
 
 def test_the_verdict_comes_first(tmp_path):
@@ -127,6 +149,24 @@ def test_a_frozen_prediction_beside_known_cameras_is_called_what_it_is(tmp_path)
     assert "what differs from it is not the adaptation alone" in text
     assert "adapted, from frozen, own cameras" in text
     assert "4 poses, 4 intrinsics, positions times 2.5" in text
+    for facts, label in (
+        ({"known_cameras": known}, "frozen, own cameras"),
+        ({"one_camera": {}}, "frozen"),
+        ({}, "frozen"),
+    ):
+        shown = before_adaptation(folder, {"known_cameras": None, "one_camera": None, **facts})
+        assert shown.label == label, "in the fly-through as in the report"
+
+
+def test_the_list_of_files_stays_true_when_depth_of_another_size_is_exported(tmp_path):
+    folder = write_example(tmp_path / "out", truth=False)
+    result = Reconstruction.load(folder)
+    photos = [MemoryPhoto(n, np.zeros((*hw, 3), np.uint8)) for n, hw in zip(result.names, result.photo_hw, strict=True)]
+    for size in ("photo", "model"):
+        export(result, folder, ["depth"], photos=photos, depth_size=size)
+        assert ("interpolated" in contents(folder)["depth"]) == (size == "photo")
+        assert "interpolated" not in FILES["depth"]
+        assert ("depth", "depth/", FILES["depth"]) in page.files_beside(folder)
 
 
 def test_report_viewer_and_files_have_the_same_points(tmp_path):
@@ -147,9 +187,7 @@ def test_report_viewer_and_files_have_the_same_points(tmp_path):
     glb = trimesh.load(folder / "scene.glb", force="scene")
     (cloud,) = (g for g in glb.geometry.values() if isinstance(g, trimesh.PointCloud))
     assert 0 < len(ply) < masks.sum()
-    # The GLB file may be turned upright.
-    away = [np.sort(np.linalg.norm(points - points.mean(0), axis=1)) for points in (ply, cloud.vertices)]
-    assert np.allclose(*away, atol=1e-3)
+    assert np.array_equal(ply, cloud.vertices)
     # The viewer's points are `Stage.keep`, as tests/report/test_viewer.py checks.
     for points in (page, found.final.world_points()[found.final.keep]):
         assert np.allclose(in_order(points), in_order(ply), atol=1e-3)
@@ -234,7 +272,7 @@ def test_the_page_shows_the_points_that_the_command_kept(tmp_path):
     shape = load_result(folder).final.keep.shape
     keep = np.zeros(shape, dtype=bool)
     keep[:, :5] = True
-    report = FilterReport(pixels=keep.size, removed={"mask": int((~keep).sum()), "sky": 0}, tolerance=None)
+    report = FilterReport(pixels=keep.size, removed={"mask": int((~keep).sum()), "sky or ambiguous": 0}, tolerance=None)
     save_kept(folder, (keep, report))
     result = load_result(folder)
     assert np.array_equal(result.final.keep, keep)

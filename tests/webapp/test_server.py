@@ -11,7 +11,7 @@ from freegeo import report
 from freegeo.errors import UserError
 from freegeo.lock import LOCK_FILE
 from freegeo.models import catalog
-from freegeo.report.contents import contents
+from freegeo.report.contents import FILES
 from freegeo.report.result import SUMMARY_NAME
 from freegeo.webapp import page, server
 from freegeo.webapp.runs import PHOTOS, RESULT, Run
@@ -98,7 +98,7 @@ def test_the_files_that_the_report_links_to_are_there_and_no_others(finished):
 def test_every_file_of_a_result_is_explained_as_in_the_report(finished):
     listed = {file["name"]: file["about"] for file in page.files(finished)}
     for name in ("report.html", "prediction.npz", "reconstruction.json"):
-        assert listed[name] == contents()[name]
+        assert listed[name] == FILES[name]
 
 
 def test_the_verdict_comes_first(finished):

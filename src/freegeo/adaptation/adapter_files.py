@@ -170,13 +170,10 @@ def _camera_token(model: ReconstructionModel, folder: Path) -> dict[str, Tensor]
     return {}
 
 
-def _base(model: ReconstructionModel) -> dict[str, str]:
+def _base(model: ReconstructionModel) -> dict[str, Any]:
     loaded = getattr(model, "loaded_from", None)
-    return {
-        "model": model.spec.name,
-        "fingerprint": loaded.fingerprint if loaded else "",
-        "licence": model.spec.weights_licence,
-    }
+    weights = loaded.weights() if loaded else {"fingerprint": ""}
+    return {"model": model.spec.name, **weights, "licence": model.spec.weights_licence}
 
 
 def _require_same_base(model: ReconstructionModel, metadata: Mapping[str, Any] | None, folder: Path) -> None:

@@ -26,7 +26,7 @@ from freegeo.adaptation.recipe import Recipe
 from freegeo.adaptation.samples import Place, SceneImages, distinct, sample_key, view_keys
 from freegeo.adaptation.views import ViewSet, Visit
 from freegeo.errors import UserError
-from freegeo.host import host_available
+from freegeo.host import gigabytes, host_available
 from freegeo.models.api import ReconstructionModel, views_per_chunk
 from freegeo.models.precision import Compute
 
@@ -65,11 +65,11 @@ class Plan:
         """Return one line for the user: how much memory it takes, and what is done where that would be too much."""
         how = []
         if self.place == "disk":
-            how.append(f"{_gigabytes(self.kept_bytes)} of teacher features on disk")
+            how.append(f"{gigabytes(self.kept_bytes)} of teacher features on disk")
         if self.checkpointing:
             how.append("activations computed twice")
         slower = f" (to fit: {' and '.join(how)}, which is slower)" if how else ""
-        return f"adaptation needs about {_gigabytes(self.peak_bytes)} of memory{slower}"
+        return f"adaptation needs about {gigabytes(self.peak_bytes)} of memory{slower}"
 
 
 def plan_adaptation(
@@ -94,12 +94,12 @@ def plan_adaptation(
     for checkpointing, where in product((False, True), ("device", "disk")):
         plan = job.plan(where, checkpointing)
         if plan.peak_bytes <= budget and (plan.place != "disk" or plan.kept_bytes < free_disk):
-            logger.info("%s; %s are free", plan.summary(), _gigabytes(budget))
-            logger.debug("at the peak: %s", ", ".join(f"{name} {_gigabytes(size)}" for name, size in plan.parts))
+            logger.info("%s; %s are free", plan.summary(), gigabytes(budget))
+            logger.debug("at the peak: %s", ", ".join(f"{name} {gigabytes(size)}" for name, size in plan.parts))
             return plan
     raise UserError(
-        f"adapting {model.spec.name} needs {plan.peak_bytes / 1e9:.1f} GB even with activation checkpointing (and "
-        f"{plan.kept_bytes / 1e9:.1f} GB of disk), and {budget / 1e9:.1f} GB are free. Use smaller images "
+        f"adapting {model.spec.name} needs {gigabytes(plan.peak_bytes)} even with activation checkpointing (and "
+        f"{gigabytes(plan.kept_bytes)} of disk), and {gigabytes(budget)} are free. Use smaller images "
         "(--process-res), fewer --views, --precision bf16 or a smaller model."
     )
 
@@ -364,7 +364,7 @@ def plan_reconstruction(
         )
         raise UserError(
             f"reconstructing {views} images of {image_hw[1]} x {image_hw[0]} pixels with {model.spec.name} needs about "
-            f"{total(views) / 1e9:.1f} GB and {budget / 1e9:.1f} GB are free: {advice}."
+            f"{gigabytes(total(views))} and {gigabytes(budget)} are free: {advice}."
         )
     return parts(views), fitting
 
@@ -391,10 +391,6 @@ def available(device: torch.device, model: ReconstructionModel) -> int:
         free = int(host_available() * 0.8)
     weights = sum(p.nbytes for p in model.parameters() if p.device.type == device.type)
     return free + weights
-
-
-def _gigabytes(size: int) -> str:
-    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e9:.2f} GB"
 
 
 def _size(part: tuple[str, int]) -> int:

@@ -26,6 +26,7 @@ from freegeo.data.datasets.base import Archive
 from freegeo.data.datasets.registry import get_dataset
 from freegeo.errors import DamagedError, FreeGeoError, UserError
 from freegeo.files import inside, scratch_folder
+from freegeo.host import gigabytes
 from freegeo.models.hub import (
     HubFile,
     digest_of,
@@ -220,11 +221,6 @@ def unpack(one: Offer, data: Path, on_bytes: Callable[[int, int], None] = lambda
 def free_bytes(folder: Path) -> int:
     """Return the bytes that are free on the disk of a folder, which need not exist yet."""
     return shutil.disk_usage(next(f for f in (folder, *folder.absolute().parents) if f.exists())).free
-
-
-def gigabytes(size: float) -> str:
-    """Return a size as text."""
-    return f"{size / 1e9:.1f} GB" if size >= 5e7 else f"{size / 1e6:.1f} MB"
 
 
 def _members(archive: zipfile.ZipFile, one: Offer, folder: Path) -> list[zipfile.ZipInfo]:

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING
 from freegeo import __version__
 from freegeo.cli import console
 from freegeo.errors import FreeGeoError, PartialResultError, UserError
+from freegeo.host import end_with_parent
 
 if TYPE_CHECKING:
     from cyclopts import App
@@ -227,6 +228,7 @@ def entry() -> None:
     """Console script: exit with the command's code."""
     # A run that is asked to end saves its state, as after Ctrl-C.
     signal.signal(signal.SIGTERM, lambda *arguments: sys.exit(TERMINATED))
+    end_with_parent()
     code = main()
     console.finish_streams()
     # Worker threads of third-party libraries must not hold the process after everything is written.

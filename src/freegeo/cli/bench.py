@@ -14,6 +14,7 @@ from freegeo.adaptation.recipe import PAPER_SEED, RecipeName
 from freegeo.cli import console
 from freegeo.cli.options import ModelOptions, RecipeOptions, use_few_threads
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.host import gigabytes
 from freegeo.models.catalog import EMBEDDED_MODEL
 from freegeo.progress import progress_bar
 
@@ -174,8 +175,8 @@ def download(*names: str, data: Path = DATA, yes: bool = False) -> None:
     missing = sum(one.size - one.kept for one in waiting)
     free = archives.require_room(data, waiting)
     console.say(
-        f"source: {archives.PAGE}\nto download: {archives.gigabytes(missing)}; free on the disk of {data}: "
-        f"{archives.gigabytes(free)}. The content is larger than the archives; it is measured before it is unpacked."
+        f"source: {archives.PAGE}\nto download: {gigabytes(missing)}; free on the disk of {data}: "
+        f"{gigabytes(free)}. The content is larger than the archives; it is measured before it is unpacked."
     )
     _require_yes(yes)
     with locked(data):
@@ -185,13 +186,11 @@ def download(*names: str, data: Path = DATA, yes: bool = False) -> None:
                 archives.unpack(one, data, lambda done, total, update=update, one=one: update(
                     done * (1 + one.size // 1_000_000) // max(1, total)
                 ))  # fmt: skip
-            console.say(f"{one.name}: unpacked; {one.path} ({archives.gigabytes(one.size)}) is not needed any more")
+            console.say(f"{one.name}: unpacked; {one.path} ({gigabytes(one.size)}) is not needed any more")
             _require([check_dataset(data, one.name)], data, "usable", "not to be used")
 
 
 def _offered(one: Offer) -> str:
-    from freegeo.benchmark.download import gigabytes
-
     if one.state == "complete":
         return "complete, nothing to do"
     if one.state == "archive":

@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
+from freegeo.host import size_text
 from freegeo.progress import Remembering
 
 STANDARD_OUTPUT = "standard output"
@@ -160,8 +161,4 @@ def written(folder: Path, files: Mapping[str, str]) -> None:
 def size(path: Path) -> str:
     """Return the size of a file or folder as text."""
     total = sum(p.stat().st_size for p in path.rglob("*") if p.is_file()) if path.is_dir() else path.stat().st_size
-    for unit in ("B", "kB", "MB"):
-        if total < 1000:
-            return f"{total:.0f} {unit}" if unit == "B" else f"{total:.1f} {unit}"
-        total /= 1000
-    return f"{total:.1f} GB"
+    return size_text(total)

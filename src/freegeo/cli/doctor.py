@@ -22,6 +22,7 @@ from cyclopts import Parameter
 from freegeo import __version__
 from freegeo.cli import console
 from freegeo.errors import FreeGeoError
+from freegeo.host import gigabytes
 
 EXTRAS: Mapping[str, tuple[str, str]] = {
     "colmap": ("pycolmap", "refinement of cameras, recipe evidence, COLMAP projects"),
@@ -342,7 +343,7 @@ def _advise(found: Findings) -> None:
             found.next.append(f"{model.name} is not complete: `freegeo models download {model.name}` completes it.")
     if found.torch and found.hub["cache"] and not any(model.complete for model in found.models):
         item = catalog.entry(catalog.DEFAULT_MODEL)
-        size = f"{item.download_bytes / 1e9:.1f} GB"
+        size = gigabytes(item.download_bytes)
         found.next.append(
             f"No published model is on this machine: `freegeo models download {item.name}` fetches the default one "
             f"({size}); {catalog.EMBEDDED_MODEL}, which is in the package, is for demonstrations and tests only."
@@ -359,16 +360,19 @@ def _say(found: Findings) -> None:
     console.say(f"freegeo {found.freegeo}, Python {found.python}, {found.platform}")
     console.say(f"torch {found.torch} ({found.torch_build})" if found.torch else "torch: none that works")
     for device in found.devices:
-        memory = f", {_gb(device['memory'])}, {_gb(device['free'])} of them free" if "memory" in device else ""
+        memory = (
+            f", {gigabytes(device['memory'])}, {gigabytes(device['free'])} of them free" if "memory" in device else ""
+        )
         console.say(f"{device['name']}: {device['about']}{memory}")
-    console.say(f"cpu: {found.cores} cores, {_gb(found.memory_free)} of memory free")
+    console.say(f"cpu: {found.cores} cores, {gigabytes(found.memory_free)} of memory free")
     for place, free in found.disk_free.items():
-        console.say(f"disk: {_gb(free)} free for {place}")
+        console.say(f"disk: {gigabytes(free)} free for {place}")
     rows = [(extra.name, extra.version or "", extra.state, extra.install, extra.about) for extra in found.extras]
     console.say("\n" + console.table(("extra", "version", "state", "installed by", "for"), rows, prose=100))
     if found.models:
         rows = [
-            (one.name, _gb(one.bytes), "complete" if one.complete else "incomplete", one.path) for one in found.models
+            (one.name, gigabytes(one.bytes), "complete" if one.complete else "incomplete", one.path)
+            for one in found.models
         ]
         console.say("\n" + _lines("models on this machine", ("  ".join(row) for row in rows)))
     elif found.torch:
@@ -383,10 +387,6 @@ def _say(found: Findings) -> None:
 
 def _lines(title: str, lines: Iterable[str]) -> str:
     return "\n".join([f"{title}:", *(f"  {line}" for line in lines)])
-
-
-def _gb(size: int) -> str:
-    return f"{size / 1e9:.1f} GB"
 
 
 def _reason(error: BaseException) -> str:

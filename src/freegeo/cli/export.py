@@ -91,7 +91,7 @@ def export(
             depth_size = "photo" if summary["settings"].get("depth_size") == "photo" else "model"
         before = None
         if home.resolve() == run and summary.get("adapter"):
-            before = before_adaptation(home, summary.get("refinement"))
+            before = before_adaptation(home, summary)
         if before is not None and filters is not None:
             before = replace(before, filters=filters.settings())
         place = result_folder(target) or target

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import logging
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 
     from freegeo.cli.options import OutputOptions
     from freegeo.types import PhotoLike
+
+logger = logging.getLogger(__name__)
 
 Size = tuple[int, int]
 
@@ -116,8 +120,26 @@ class FileOptions:
         return chosen_formats([*there, *asked])
 
     def checked_masks(self, photos: Sequence[PhotoLike]) -> list[np.ndarray] | None:
-        """Read the masks of photos, and refuse what cannot be used before anything is computed."""
+        """Read the masks of photos, and refuse what cannot be used before anything is computed.
+
+        Warns of masks beside the photos that are not asked for.
+        """
+        if self.filters.masks is None:
+            for folder in unused_masks(photos):
+                logger.warning(
+                    "%s holds images that are not used; if these are the masks of the photos, add `--masks %s`.",
+                    folder, shlex.quote(str(folder)),
+                )  # fmt: skip
         return self.filters.load_masks([photo.name for photo in photos], [photo.size_hw for photo in photos])
+
+
+def unused_masks(photos: Sequence[PhotoLike]) -> list[Path]:
+    """Return the folders `masks` beside photos that hold images."""
+    from freegeo.data.photos import MASK_FOLDER, folders_with_images
+    from freegeo.export.photos import own_file
+
+    files = [file for photo in photos if (file := own_file(photo)) is not None]
+    return list(folders_with_images(dict.fromkeys(file.parent / MASK_FOLDER for file in files)))
 
 
 def require_complete(folder: Path, failed: Mapping[str, str], sequence: Mapping[str, Any] | None = None) -> None:

@@ -111,7 +111,7 @@ def run_job(
             output.output, settings, found, overwrite=output.overwrite, trusted=cameras.trust_cameras,
             load=model_options.load, spec=empty.spec, recipe=plan, seed=model_options.seed, compute=compute,
             hooks=hooks, command=console.command_line(), warnings=console.warned(), after=after,
-            filters=files.filters.settings(), checkpoint=model_options.checkpoint_identity, **same,
+            filters=files.filters.settings(), checkpoint=model_options.origin(), **same,
         )  # fmt: skip
     if finished_at is not None:
         say_finished(output.output, finished_at)
@@ -215,7 +215,7 @@ def describe(summary: dict[str, Any], folder: Path) -> None:
     console.say(f"licence of the weights: {summary['licence_of_weights']}")
     for sentence in summary["warnings"]:
         console.say(f"warning: {sentence}")
-    console.written(folder, contents(depth_size=summary["settings"].get("depth_size")))
+    console.written(folder, contents(folder))
 
 
 def say_known(summary: dict[str, Any]) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from freegeo.cli import console
+from freegeo.host import gigabytes
 from freegeo.models import catalog
 from freegeo.progress import progress_bar
 
@@ -55,11 +56,6 @@ def _download(needs: ModelNeeds) -> str:
     if needs.download is not None:
         return gigabytes(needs.download)
     return "included" if needs.entry.packaged_weights else "none"
-
-
-def gigabytes(size: float) -> str:
-    """Return a number of bytes as text for a table."""
-    return f"{size / 1e9:.1f} GB" if size >= 5e7 else "< 0.1 GB"
 
 
 @app.command

@@ -113,6 +113,12 @@ class ModelOptions:
         path = self.weights()
         return {"file": path.name, "fingerprint": fingerprint(path)}
 
+    def origin(self) -> dict[str, Any]:
+        """Return what reconstruction.json says of the weights; local ones are read whole, for their SHA-256."""
+        from freegeo.models.catalog import origin_of
+
+        return origin_of(self.name, self.checkpoint).weights()
+
     def identity(self, recipe: Recipe | None) -> dict[str, object]:
         """Return what a result depends on, for comparison with an existing folder."""
         compute = self.compute()

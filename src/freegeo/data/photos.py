@@ -49,6 +49,8 @@ logger = logging.getLogger(__name__)
 
 MAX_VIEWS = 32
 """Default limit of the photos that are used of a source."""
+MASK_FOLDER = "masks"
+"""Folder of masks beside photos."""
 _SYSTEM_FILES = frozenset({"thumbs.db", "desktop.ini"})
 _NAMED = 5
 """Most files that a warning names."""
@@ -251,7 +253,7 @@ def _found_files(source: str | Path) -> list[Path]:
     path = Path(source).expanduser()
     if path.is_dir():
         photos, folders = _photos_among(str(path), _by_name(path.iterdir())), _sub_folders(path)
-        if full := _with_photos(folders) if photos else []:
+        if full := _with_photos(folder for folder in folders if folder != path / MASK_FOLDER) if photos else []:
             logger.warning(
                 "%s: sub-folders are not searched, and %d hold images: %s. If these are photos of this scene, give all "
                 "photos as a list of files or with a pattern such as %s.",
@@ -318,10 +320,15 @@ def _no_photos(where: str, folders: Sequence[Path]) -> list[Path]:
     )
 
 
-def _with_photos(folders: Sequence[Path]) -> list[str]:
+def _with_photos(folders: Iterable[Path]) -> list[str]:
     """Return the folders that hold images by their names, each with the number of these."""
-    counts = {folder: sum(_named_image(path) for path in folder.iterdir()) for folder in folders}
-    return [f"{folder} ({count})" for folder, count in counts.items() if count]
+    return [f"{folder} ({count})" for folder, count in folders_with_images(folders).items()]
+
+
+def folders_with_images(folders: Iterable[Path]) -> dict[Path, int]:
+    """Return those of some folders that are there and hold files named like images, each with the number of these."""
+    counts = {folder: sum(map(_named_image, folder.iterdir())) for folder in folders if folder.is_dir()}
+    return {folder: count for folder, count in counts.items() if count}
 
 
 def _named_image(path: Path) -> bool:

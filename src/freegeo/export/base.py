@@ -46,6 +46,8 @@ class Format:
     name: str
     path: str
     """The file or folder that it writes, relative to the folder of the export."""
+    more: tuple[str, ...] = ()
+    """Folders that it writes for that file, which are nothing without it."""
     about: str
     """Short description for lists of files."""
     write: Callable[[Export], list[Path]]
@@ -169,7 +171,6 @@ class Export:
 
         Warns when the photos are not at hand.
         """
-        from freegeo import files
         from freegeo.export.photos import link_copies, write_copies
 
         names = self.reconstruction.names
@@ -185,5 +186,4 @@ class Export:
         else:
             written = write_copies(self.photos, folder)
             self.copies.extend(written)
-        files.remove_written(folder, keep=written)
         return written

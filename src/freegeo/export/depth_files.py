@@ -8,8 +8,9 @@ other views.
 
 from __future__ import annotations
 
+import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from html import escape
 from importlib.util import find_spec
@@ -20,7 +21,7 @@ import numpy as np
 
 from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.export.base import Export, Format
+from freegeo.export.base import DepthSize, Export, Format
 from freegeo.export.colours import DEPTH_MAP, colour_table, log_colours, log_range
 from freegeo.export.photos import check_names, new_names, pixels_of
 from freegeo.export.reconstruction import Reconstruction
@@ -28,12 +29,14 @@ from freegeo.export.reconstruction import Reconstruction
 logger = logging.getLogger(__name__)
 
 LARGEST = 65535
+SIDECAR = "depth.json"
+"""File beside the maps that says what their values mean."""
 CHANNEL = "Y"
 """Channel of the EXR files: luminance, which OpenCV and Blender read as one grey image."""
 _LIMITS = "Filters of points (confidence, flying pixels, other views) are not applied."
 _NOTHING = "no valid depth, or outside the masks."
 _VALUES = f"depth along the optical axis; 0: {_NOTHING} {_LIMITS}"
-_SIZES = {
+_SIZES: dict[DepthSize, str] = {
     "model": "that of the model's images",
     "photo": "that of the photos, interpolated from the model's along the edges of the photo",
 }
@@ -73,26 +76,45 @@ def photo_depth(export: Export, view: int, known: np.ndarray) -> np.ndarray:
     return upsampled_depth(r.depth_z[view], known, r.images[view], photo, r.scale_xy[view], r.offset_xy[view])
 
 
+def size_of(folder: Path) -> DepthSize | None:
+    """Return the size of the depth files in a folder, as they say themselves; None where that cannot be read."""
+    try:
+        said = files.read_json(folder / SIDECAR)["size"]
+    except (OSError, FreeGeoError, TypeError, KeyError):
+        return None
+    return next((size for size in _SIZES if _SIZES[size] == said), None)
+
+
 def depth_names(names: Sequence[str], suffix: str = ".png") -> list[str]:
     """File names of the maps: the photos' with the suffix, added to the old one where photos differ in it only."""
     return new_names(names, [suffix] * len(names))
 
 
 def _write_maps(
-    export: Export, folder: str, suffix: str, about: dict[str, Any], write: Callable[[np.ndarray, Path], None]
+    export: Export,
+    folder: str,
+    suffix: str,
+    about: dict[str, Any],
+    write: Callable[[np.ndarray, Path], None],
+    more: Mapping[str, str] | None = None,
 ) -> list[Path]:
-    """Write a map of each view, one after the other, and depth.json; returns the files."""
-    place, r = export.folder / folder, export.reconstruction
+    """Write a map of each view, depth.json, and `more` (file name -> text); returns the files.
+
+    They replace earlier ones together: maps are never beside a depth.json that holds the scale of others.
+    """
+    place, r, size = export.folder / folder, export.reconstruction, _SIZES[export.depth_size]
     maps = dict(zip(r.names, depth_names(r.names, suffix), strict=True))
-    paths = [files.inside(place, name) for name in maps.values()]
-    for path, depth in zip(paths, depth_maps(export), strict=True):
-        with files.atomic_path(path) as part:
-            write(depth, part)
-    size = _SIZES[export.depth_size]
+    said = json.dumps({**about, "lengths": r.lengths, "size": size, "maps": maps}, indent=2, ensure_ascii=False)
+    texts = {SIDECAR: f"{said}\n", **(more or {})}
+    names = [*maps.values(), *texts]
+    with files.atomic_files(place, names) as paths:
+        for path, depth in zip(paths, depth_maps(export), strict=False):
+            write(depth, path)
+        for path, text in zip(paths[len(maps) :], texts.values(), strict=True):
+            path.write_text(text, encoding="utf-8")
     if export.depth_size == "photo":
         logger.info("%s: the size of the maps is %s.", place, size)
-    files.write_json(place / "depth.json", {**about, "lengths": r.lengths, "size": size, "maps": maps})
-    return [*paths, place / "depth.json"]
+    return [place / name for name in names]
 
 
 def _write_png(export: Export) -> list[Path]:
@@ -130,11 +152,8 @@ def _write_pictures(export: Export) -> list[Path]:
         "nearest": near, "farthest": far, "colours": f"{DEPTH_MAP} of matplotlib, logarithmic from nearest to farthest",
         "meaning": f"picture of the depth along the optical axis, one range for all photos; grey: {_NOTHING} {_LIMITS}",
     }  # fmt: skip
-    written = _write_maps(export, PICTURES.path, ".png", about, write)
-    legend = export.folder / PICTURES.path / "legend.svg"
-    with files.atomic_path(legend) as part:
-        part.write_text(_legend(near, far, export.reconstruction), encoding="utf-8")
-    return [*written, legend]
+    more = {"legend.svg": _legend(near, far, export.reconstruction)}
+    return _write_maps(export, PICTURES.path, ".png", about, write, more)
 
 
 def _legend(near: float, far: float, r: Reconstruction) -> str:

@@ -178,6 +178,10 @@ def export(
         except FreeGeoError as error:
             failed[format.name] = str(error)
             logger.warning("Format %s is not written: %s", format.name, error)
+        finally:
+            # Also when the export stops here, nothing stays that is of no use without the format's own file.
+            for name in format.more:
+                files.remove_written(folder / name, keep=done)
         files.remove_written(folder / format.path, keep=done)
         written += done
     return Exported(files=list(dict.fromkeys(written)), failed=failed)

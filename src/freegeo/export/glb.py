@@ -1,7 +1,8 @@
-"""``scene.glb``: coloured points and one small frustum per camera, in glTF axes (y up, cameras look along -z).
+"""``scene.glb``: coloured points and one small frustum per camera, below a node that turns them to glTF axes.
 
-Its y axis is up in the room where that can be told (`freegeo.export.gravity`), which turns points and frusta together;
-otherwise it is the up of the reconstruction's world. No other file is turned. The scene's extras say which it is.
+Vertices are in the reconstruction's world, as in all other files. The matrix of their parent, the node
+`reconstruction`, turns it to glTF's world (y up): upright where up can be told (`freegeo.export.gravity`), otherwise
+the axes are only renamed. The scene's extras say which it is.
 """
 
 from __future__ import annotations
@@ -23,6 +24,10 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 FILE_NAME = "scene.glb"
+NODE = "reconstruction"
+"""Name of the node whose matrix turns the reconstruction's world to that of the file."""
+OPENCV_TO_GLTF = np.diag((1.0, -1.0, -1.0))
+"""Rotation from OpenCV axes (y down, z forward) to glTF axes (y up, z backward): half a turn about x, and back."""
 UP_UNKNOWN = "not known: the cameras disagree, so it is that of the reconstruction's world"
 FRUSTUM_SHARE = 0.08
 """Depth of a frustum as a share of the median distance of the points from the cameras that saw them."""
@@ -38,14 +43,6 @@ _BOX_FACES = (
 )
 
 
-def opencv_to_gltf(vectors: np.ndarray) -> np.ndarray:
-    """Turn vectors (..., 3) from OpenCV axes (y down, z forward) to glTF axes (y up, z backward), half a turn about x.
-
-    It is its own inverse.
-    """
-    return vectors * np.asarray((1, -1, -1), dtype=vectors.dtype)
-
-
 def write_glb(
     cloud: PointCloud,
     T_cam_world: np.ndarray,
@@ -58,8 +55,8 @@ def write_glb(
 ) -> Path:
     """Write points and camera frusta.
 
-    The scene's objects are named `points` and `camera_000`, `camera_001`, ... in view order; its extras say the unit
-    and what up rests on.
+    The scene's objects are named `points` and `camera_000`, `camera_001`, ... in view order, all below the node
+    `NODE`; its extras say the unit and what up rests on.
 
     Args:
         cloud: world points.
@@ -68,7 +65,7 @@ def write_glb(
         image_hw: height and width.
         path: of the file.
         lengths: that of the reconstruction.
-        up: becomes +y; None: the axes of the world are only renamed (`opencv_to_gltf`).
+        up: becomes +y by the node's matrix; None: that only renames the axes of the world (`OPENCV_TO_GLTF`).
 
     Raises:
         FreeGeoError: there is no point.
@@ -76,17 +73,20 @@ def write_glb(
     import trimesh
 
     require_points(cloud, path)
-    turn = np.diag(opencv_to_gltf(np.ones(3))) if up is None else upright_rotation(up.direction, T_cam_world)
+    turn = np.eye(4)
+    turn[:3, :3] = OPENCV_TO_GLTF if up is None else upright_rotation(up.direction, T_cam_world)
     scene = trimesh.Scene(metadata={"lengths": lengths, "up": UP_UNKNOWN if up is None else up.source})
-    points = trimesh.PointCloud(cloud.points @ turn.T.astype(np.float32), colors=cloud.colours)
-    scene.add_geometry(points, geom_name="points", node_name="points")
+    scene.graph.update(NODE, matrix=turn)
+    points = trimesh.PointCloud(cloud.points, colors=cloud.colours)
+    scene.add_geometry(points, geom_name="points", node_name="points", parent_node_name=NODE)
     size = FRUSTUM_SHARE * _typical_depth(cloud, T_cam_world)
     for view, colour in enumerate(order_colours(len(K))):
         corners = frustum_corners(T_cam_world[view], K[view], image_hw, size)
         vertices, faces = _beams(corners, BEAM_SHARE * size)
         colours = np.tile(colour, (len(vertices), 1))
-        mesh = trimesh.Trimesh(vertices @ turn.T, faces, vertex_colors=colours, process=False)
-        scene.add_geometry(mesh, geom_name=f"camera_{view:03d}", node_name=f"camera_{view:03d}")
+        mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
+        name = f"camera_{view:03d}"
+        scene.add_geometry(mesh, geom_name=name, node_name=name, parent_node_name=NODE)
     with files.atomic_path(path) as part:
         part.write_bytes(scene.export(file_type="glb"))
     return path

@@ -81,36 +81,34 @@ def write_nerfstudio(
 
 def _write_depth(export: Export) -> list[Path]:
     """Write the depth of the kept pixels at the photos' size; nothing where there are none, or no photos."""
-    folder, written = export.folder / DEPTH_FOLDER, []
-    if export.photos is not None and export.keep.any():
-        names, valid = export.reconstruction.names, export.reconstruction.valid_pixels() & export.keep
-        for view, name in enumerate(depth_names(names, ".npy")):
-            path = files.inside(folder, name)
-            depth = photo_depth(export, view, valid[view]) / np.float32(DEPTH_UNIT)
-            with files.atomic_path(path) as part, part.open("wb") as file:
-                np.save(file, depth)
-            written.append(path)
-    files.remove_written(folder, keep=written)
-    return written
+    if export.photos is None or not export.keep.any():
+        return []
+    folder, valid = export.folder / DEPTH_FOLDER, export.reconstruction.valid_pixels() & export.keep
+    names = depth_names(export.reconstruction.names, ".npy")
+    with files.atomic_files(folder, names) as paths:
+        for view, path in enumerate(paths):
+            with path.open("wb") as file:
+                np.save(file, photo_depth(export, view, valid[view]) / np.float32(DEPTH_UNIT))
+    return [folder / name for name in names]
 
 
 def _write_masks(export: Export) -> list[Path]:
     """Write the user's masks at the photos' size, black where the model did not see them; nothing without masks."""
     from PIL import Image
 
-    folder, written = export.folder / MASK_FOLDER, []
-    if export.masks is not None:
-        for view, name in enumerate(depth_names(export.reconstruction.names)):
-            path = files.inside(folder, name)
+    if export.masks is None:
+        return []
+    folder, names = export.folder / MASK_FOLDER, depth_names(export.reconstruction.names)
+    with files.atomic_files(folder, names) as paths:
+        for view, path in enumerate(paths):
             mask = mask_for_photo(export.reconstruction, view, export.masks[view])
-            with files.atomic_path(path) as part:
-                Image.fromarray(np.where(mask, np.uint8(255), np.uint8(0))).save(part, compress_level=1)
-            written.append(path)
-    files.remove_written(folder, keep=written)
-    return written
+            Image.fromarray(np.where(mask, np.uint8(255), np.uint8(0))).save(path, compress_level=1)
+    return [folder / name for name in names]
 
 
 def _write(export: Export) -> list[Path]:
+    # It names the files that are written here: it goes before these change, and comes when they are complete.
+    files.remove_written(export.folder / FILE_NAME)
     copies = export.write_photos(export.folder / photos.FOLDER)
     try:
         points = export.write(ply.FORMAT)
@@ -127,5 +125,10 @@ def _write(export: Export) -> list[Path]:
 
 
 FORMAT = Format(
-    name="nerfstudio", path=FILE_NAME, about="nerfstudio cameras, for images/", write=_write, check=photos.check_names
+    name="nerfstudio",
+    path=FILE_NAME,
+    more=(DEPTH_FOLDER, MASK_FOLDER),
+    about="nerfstudio cameras, for images/",
+    write=_write,
+    check=photos.check_names,
 )

@@ -60,22 +60,20 @@ def check_names(names: Sequence[str]) -> None:
 
 
 def write_copies(photos: Sequence[PhotoLike], folder: Path) -> list[Path]:
-    """Write upright 8-bit copies of photos; FreeGeoError when one can no longer be read."""
+    """Write upright 8-bit copies of photos, in place of earlier ones; FreeGeoError when one can no longer be read."""
     from PIL import Image
 
-    paths = []
-    for photo, name in zip(photos, copy_names([photo.name for photo in photos]), strict=True):
-        path = files.inside(folder, name)
-        with files.atomic_path(path) as part:
+    names = copy_names([photo.name for photo in photos])
+    with files.atomic_files(folder, names) as paths:
+        for photo, path in zip(photos, paths, strict=True):
             stored = _readable_as_stored(photo, path.suffix.lower())
             if stored is not None:
-                part.write_bytes(stored)
+                path.write_bytes(stored)
             elif path.suffix.lower() == ".png":
-                Image.fromarray(pixels_of(photo)).save(part, compress_level=1)
+                Image.fromarray(pixels_of(photo)).save(path, compress_level=1)
             else:
-                Image.fromarray(pixels_of(photo)).save(part, quality=JPEG_QUALITY, subsampling=0)
-        paths.append(path)
-    return paths
+                Image.fromarray(pixels_of(photo)).save(path, quality=JPEG_QUALITY, subsampling=0)
+    return [folder / name for name in names]
 
 
 def _readable_as_stored(photo: PhotoLike, suffix: str) -> bytes | None:
@@ -105,14 +103,14 @@ def pixels_of(photo: PhotoLike) -> np.ndarray:
 
 def link_copies(copies: Sequence[Path], names: Sequence[str], folder: Path) -> list[Path]:
     """Put copies that were written elsewhere into another folder too, without taking their space again if possible."""
-    paths = [files.inside(folder, name) for name in copy_names(names)]
-    for copy, path in zip(copies, paths, strict=True):
-        with files.atomic_path(path) as part:
+    names = copy_names(names)
+    with files.atomic_files(folder, names) as paths:
+        for copy, path in zip(copies, paths, strict=True):
             try:
-                os.link(copy, part)
+                os.link(copy, path)
             except OSError:
-                shutil.copyfile(copy, part)
-    return paths
+                shutil.copyfile(copy, path)
+    return [folder / name for name in names]
 
 
 def own_file(photo: PhotoLike) -> Path | None:

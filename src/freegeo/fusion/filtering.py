@@ -25,13 +25,18 @@ STEEPEST_SLOPE = 12.0
 """Tangent of the steepest angle (85 degrees) between a surface and the image plane that is kept."""
 
 
+SKY = "sky or ambiguous"
+"""Filter of what a model marks as having no depth: sky, or of MapAnything, pixels that are ambiguous to it."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class FilterReport:
     """How many pixels each filter removed of those that were left, in the order the filters ran."""
 
     pixels: int
     removed: Mapping[str, int]
-    """Of `outside the photo`, `invalid depth`, `mask`, `sky`, `confidence`, `flying`, `multi-view`: those that ran."""
+    """Those that ran of `outside the photo`, `invalid depth`, `mask`, `sky or ambiguous`, `confidence`, `flying`,
+    `multi-view`."""
     tolerance: float | None
     """Relative depth tolerance of the multi-view filter; None when it did not run."""
 
@@ -104,7 +109,7 @@ def filter_pixels(
         apply("mask", lambda view: wanted[view].bool())
     if sky is not None and settings.sky_limit <= 1:
         seen = _tensor(sky)
-        apply("sky", lambda view: seen[view] < settings.sky_limit)
+        apply(SKY, lambda view: seen[view] < settings.sky_limit)
     if settings.drop_share > 0:
         confident = confident_pixels(_tensor(conf), keep, drop_share=settings.drop_share)
         apply("confidence", lambda view: confident[view])

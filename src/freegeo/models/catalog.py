@@ -123,9 +123,7 @@ def load_model(name: str = DEFAULT_MODEL, *, checkpoint: str | Path | None = Non
         remedy = f"`freegeo models download {item.name}` checks that file and replaces it if it is damaged."
         raise UserError(f"{error} {remedy}") from None
     model.eval()
-    model.loaded_from = LoadedFrom(
-        model=item.name, file=path.name, fingerprint=checkpoints.fingerprint(path), licence=item.licence
-    )
+    model.loaded_from = origin_of(name, checkpoint)
     logger.info("%s loaded from %s; licence of the weights: %s", item.name, path, item.licence)
     return model
 
@@ -136,6 +134,22 @@ def weights_file(name: str, checkpoint: str | Path | None = None) -> Path:
 
     item = entry(name)
     return checkpoints.find_file(Path(checkpoint)) if checkpoint else _packaged_or_downloaded(item)
+
+
+def origin_of(name: str, checkpoint: str | Path | None = None) -> LoadedFrom:
+    """Return where a model's weights come from; the file is looked up, or downloaded, as by `load_model`."""
+    from freegeo.models import checkpoints, hub
+
+    item, path = entry(name), weights_file(name, checkpoint)
+    known, from_hub = None, checkpoint is None and item.packaged_weights is None
+    if from_hub:
+        # It was compared, with the catalog or the first download.
+        known = hub.noted_digest(path)
+    return LoadedFrom(
+        model=item.name, file=path.name, fingerprint=checkpoints.fingerprint(path), licence=item.licence,
+        sha256={path.name: known} if known else checkpoints.sha256_of_parts(path),
+        hub_id=item.hub_id if from_hub else None, revision=hub.revision_of(path, item) if from_hub else None,
+    )  # fmt: skip
 
 
 def download(name: str, *, check_hash: bool = False) -> Path:

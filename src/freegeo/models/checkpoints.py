@@ -16,6 +16,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict, TypeVar
 
@@ -381,6 +382,18 @@ def fingerprint(path: Path) -> str:
             file.seek(max(0, size - _BLOCK_BYTES) * i // (_BLOCKS - 1))
             digest.update(file.read(_BLOCK_BYTES))
     return digest.hexdigest()[:16]
+
+
+def sha256_of_parts(path: Path) -> dict[str, str]:
+    """Return the SHA-256 of a checkpoint's files by their names; a file is read again when it has changed."""
+    return {part.name: _sha256(part, part.stat().st_mtime_ns) for part in parts_of(path)}
+
+
+@lru_cache(maxsize=64)
+def _sha256(path: Path, changed: int) -> str:
+    from freegeo.models.hub import sha256_of
+
+    return sha256_of(path)
 
 
 def build_on_meta(build: Callable[[], Model]) -> Model:

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from freegeo.errors import UserError
+from freegeo.host import gigabytes
 from freegeo.models.catalog import EMBEDDED_MODEL
 from freegeo.models.spec import ModelEntry
 
@@ -69,7 +70,7 @@ def fetch(item: ModelEntry, *, check_hash: bool = False) -> Path:
     revision, expected = item.revision, item.sha256
     if first := kept or _gone(item):
         # What was downloaded first counts, not what the hub calls its newest today.
-        revision, expected = revision or _revision(first, item), expected or _known_digest(first)
+        revision, expected = revision or revision_of(first, item), expected or _known_digest(first)
     if kept is not None:
         if is_verified(kept, expected, check_hash=check_hash):
             return kept
@@ -99,7 +100,7 @@ def fetch(item: ModelEntry, *, check_hash: bool = False) -> Path:
         logger.debug("download of %s failed: %r", item.hub_id, error)
         reason, remedy = why(error, _described(item))
         missing = "is not on this machine" if kept is None else f"is damaged ({kept})"
-        size = f"{item.download_bytes / 1e9:.1f} GB"
+        size = gigabytes(item.download_bytes)
         raise UserError(
             f"the checkpoint of {item.name} ({item.hub_id}, {size}) {missing} and could not be downloaded: {reason}. "
             f"{remedy} and run `freegeo models download {item.name}`, {_INSTEAD}"
@@ -196,7 +197,7 @@ def _complete(url: str, part: Path, size: int | None) -> str:
 def local_file(item: ModelEntry) -> tuple[str, str] | None:
     """Return the revision and the SHA-256 of a model's file in the cache of the hub; None without one."""
     kept = _kept(item)
-    return None if kept is None else (_revision(kept, item), sha256_of(kept))
+    return None if kept is None else (revision_of(kept, item), sha256_of(kept))
 
 
 def cache_folder() -> Path:
@@ -305,7 +306,7 @@ def _lock(item: ModelEntry, announced: HfFileMetadata) -> Path:
     return folder.parent / ".locks" / folder.name / f"{announced.etag}.lock"
 
 
-def _revision(kept: Path, item: ModelEntry) -> str:
+def revision_of(kept: Path, item: ModelEntry) -> str:
     """Return the commit of a file in the cache: the name of the folder that holds the repository's files."""
     return kept.parents[len(Path(item.hub_file).parts) - 1].name
 

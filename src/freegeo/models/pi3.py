@@ -206,8 +206,14 @@ class Pi3(ReconstructionModel):
         require_no_choice(reference, self.spec.name)
         if priors is not None:
             require_usable(priors, self.spec)
-        levels = self._levels(tokens.tokens, tokens.grid_hw, wanted)
+        levels = self._levels_of(tokens, priors, wanted)
         return Features(levels=levels, image_hw=tokens.image_hw, grid_hw=tokens.grid_hw)
+
+    def _levels_of(
+        self, tokens: ViewTokens, priors: Priors | None, wanted: set[int]
+    ) -> dict[int, tuple[Tensor, Tensor]]:
+        """Return the levels of tokens, with priors that this model can be told."""
+        return self._levels(tokens.tokens, tokens.grid_hw, wanted)
 
     def _levels(
         self,

@@ -6,20 +6,17 @@ Letters as in pi3.py.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
-from freegeo.models.api import check_layers, level_tokens
+from freegeo.models.api import level_tokens
 from freegeo.models.dpt import uv_axes
 from freegeo.models.pi3 import EPS, Pi3
 from freegeo.models.pi3_config import Pi3Config, Pi3XConfig
 from freegeo.models.pi3_priors import Given, PoseTables, given_of, pose_tables, turn
-from freegeo.models.priors import require_usable
-from freegeo.models.reference import require_no_choice
 from freegeo.models.spec import ModelSpec
 from freegeo.models.transformer import Attention, LayerScale, Mlp, PatchEmbed, Rope, grid_rope, rotate
 from freegeo.types import Features, Priors, ViewTokens
@@ -192,27 +189,16 @@ class Pi3X(Pi3):
         points, conf = (ConvHead(config.dense_out, outputs, config.patch_size, self._x) for outputs in ((2, 1), (1,)))
         return points, conf
 
-    def aggregate(
-        self,
-        tokens: ViewTokens,
-        *,
-        layers: Collection[int] | None = None,
-        reference: str = "first",
-        priors: Priors | None = None,
-    ) -> Features:
-        """Run the pairs of blocks as Pi3 does, with what is known of the views.
+    def _levels_of(
+        self, tokens: ViewTokens, priors: Priors | None, wanted: set[int]
+    ) -> dict[int, tuple[Tensor, Tensor]]:
+        """Return the levels of tokens with what is known of the views.
 
         Scale and frame of the priors have no part in the result: its lengths are metres by the model's own estimate.
         """
         if priors is None:
-            return super().aggregate(tokens, layers=layers, reference=reference)
-        wanted = {self.config.last_pair} if layers is None else set(layers)
-        check_layers(wanted, self.config.pairs + 1, self.spec.name)
-        require_no_choice(reference, self.spec.name)
-        require_usable(priors, self.spec)
-        given = given_of(priors, tokens.image_hw, tokens.tokens.device)
-        levels = self.levels_with(tokens, given, wanted)
-        return Features(levels=levels, image_hw=tokens.image_hw, grid_hw=tokens.grid_hw)
+            return super()._levels_of(tokens, priors, wanted)
+        return self.levels_with(tokens, given_of(priors, tokens.image_hw, tokens.tokens.device), wanted)
 
     def levels_with(self, tokens: ViewTokens, given: Given, wanted: set[int]) -> dict[int, tuple[Tensor, Tensor]]:
         """Return the levels of tokens with what is given, prepared as the network reads it."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from freegeo.models.api import ReconstructionModel
@@ -136,3 +136,12 @@ class LoadedFrom:
     file: str
     fingerprint: str
     licence: str
+    sha256: Mapping[str, str] = field(default_factory=dict)
+    """SHA-256 of the file, or of each part, by its name."""
+    hub_id: str | None = None
+    """Repository of the hub that the file was downloaded from, and its commit; None for a local file."""
+    revision: str | None = None
+
+    def weights(self) -> dict[str, Any]:
+        """Return what tells the weights from others, as results record it."""
+        return {name: value for name, value in asdict(self).items() if name not in ("model", "licence")}

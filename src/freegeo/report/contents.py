@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from freegeo.export import depth_files
 from freegeo.export import reconstruction as npz
 from freegeo.export.base import KEPT_NAME, TRACKS_NAME
 from freegeo.export.formats import FORMATS
@@ -28,9 +31,8 @@ FILES = {
 }
 
 
-def contents(*, depth_size: str | None = None) -> dict[str, str]:
-    """Return file -> what it is for, where depth files have the given size ("photo": that of the photos)."""
-    if depth_size != "photo":
-        return FILES
+def contents(folder: Path) -> dict[str, str]:
+    """Return file -> what it is for, for an output folder: its depth files say whether they have the photos' size."""
     depth = [format for format in FORMATS.values() if format.holds_depth]
-    return FILES | {format.path: f"{format.about}, interpolated to the size of the photos" for format in depth}
+    interpolated = [format for format in depth if depth_files.size_of(folder / format.path) == "photo"]
+    return FILES | {format.path: f"{format.about}, interpolated to the size of the photos" for format in interpolated}

@@ -10,6 +10,7 @@ from typing import Any, TypedDict
 
 from freegeo import files
 from freegeo.report.answer import answer
+from freegeo.report.rendering import fill
 
 TEMPLATE = "overview.html.j2"
 
@@ -53,14 +54,6 @@ def outcome_of(summary: Mapping[str, Any]) -> str:
 
 def write_overview(folder: Path, file_name: str, rows: Sequence[SceneRow]) -> None:
     """Write the page of a batch into its folder."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("freegeo.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True,
-    )  # fmt: skip
-    page = environment.get_template(TEMPLATE).render(
-        title=folder.resolve().name, rows=rows, counts=Counter(row.outcome for row in rows)
-    )
+    page = fill(TEMPLATE, title=folder.resolve().name, rows=rows, counts=Counter(row.outcome for row in rows))
     with files.atomic_path(folder / file_name) as part:
         part.write_text(page, encoding="utf-8")

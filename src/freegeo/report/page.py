@@ -13,8 +13,9 @@ from freegeo.export.colours import DEPTH_MAP, log_colours, log_range
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.report import figures, sequence
 from freegeo.report.answer import HEADER, NOTE, answer, rescaled
-from freegeo.report.contents import contents
+from freegeo.report.contents import FILES
 from freegeo.report.pairs import PairPicture, pair_pictures
+from freegeo.report.rendering import duration, fill
 from freegeo.report.result import LABELS, MANY_VIEWS, REPORT_NAME, Result, camera_difference, even_choice, load_result
 from freegeo.report.scene3d import ERROR_LIMIT, drawn_cameras, most_kept, scene_data
 from freegeo.types import PhotoLike
@@ -38,7 +39,7 @@ SCORE_LABELS = {
 FILTER_TEXTS = {
     "invalid depth": "no usable depth",
     "mask": "outside the user's masks",
-    "sky": "sky",
+    "sky or ambiguous": "sky, or pixels that the model calls ambiguous",
     "confidence": "least confident share",
     "flying": "between surfaces (flying pixels)",
     "multi-view": "contradicted by other views",
@@ -69,19 +70,15 @@ def write_report(
 
 
 def render(result: Result, pairs: Sequence[PairPicture] = (), photos: Sequence[PhotoLike] | None = None) -> str:
-    """The page as text; the template engine escapes values such as names of photos."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    """Return the page as text."""
     from markupsafe import Markup
 
-    environment = Environment(
-        loader=PackageLoader("freegeo.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True,
-    )  # fmt: skip
     curve = result.adaptation.get("loss_curve") or []
     course, numbers = sequence.course(result), sequence.view_numbers(result)
     # The trajectory shows the cameras already, unless there are others to compare them with.
     with_plan = result.has_cameras and (course is None or len(result.stages) > 1)
-    return environment.get_template(TEMPLATE).render(
+    return fill(
+        TEMPLATE,
         title=sequence.title(result),
         facts=facts(result),
         answer=answer(result.summary),
@@ -122,7 +119,7 @@ def render(result: Result, pairs: Sequence[PairPicture] = (), photos: Sequence[P
         adaptation=list(flattened({k: v for k, v in result.adaptation.items() if k not in ("loss_curve", "recipe")})),
         versions=list((result.summary.get("versions") or {}).items()),
         command=result.summary.get("command"),
-        files=list(files_beside(result.folder, (result.summary.get("settings") or {}).get("depth_size"))),
+        files=list(files_beside(result.folder)),
     )
 
 
@@ -136,9 +133,12 @@ def unasked(result: Result) -> str:
     return "The model's own prediction: neither adapted to these photos nor refined."
 
 
-def files_beside(folder: Path, depth_size: str | None) -> Iterator[tuple[str, str, str]]:
-    """Files of a result that exist: name, address relative to the page, purpose."""
-    for name, about in contents(depth_size=depth_size).items():
+def files_beside(folder: Path) -> Iterator[tuple[str, str, str]]:
+    """Files of a result that exist: name, address relative to the page, purpose.
+
+    A later export may write depth files of another size beside this page, so nothing is said of it.
+    """
+    for name, about in FILES.items():
         path = folder / name
         if name != REPORT_NAME and path.exists():
             yield name, f"{name}/" if path.is_dir() else name, about
@@ -164,7 +164,7 @@ def facts(result: Result) -> list[tuple[str, str]]:
     if summary.get("loss"):
         found.append(("loss", f"{summary['loss']['first']:.4f} → {summary['loss']['last']:.4f}"))
     if summary.get("seconds"):
-        found.append(("time", _duration(sum(summary["seconds"].values()))))
+        found.append(("time", duration(sum(summary["seconds"].values()))))
     found.append(("licence of the weights", summary.get("licence_of_weights") or "not stated in this folder"))
     return found
 
@@ -307,9 +307,3 @@ def flattened(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
 
 def _percent(share: float, digits: int = 1) -> str:
     return f"{100 * float(share):.{digits}f} %"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

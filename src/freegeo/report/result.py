@@ -69,7 +69,7 @@ class Stage:
     @property
     def label(self) -> str:
         """The name shown in the report."""
-        return f"{LABELS[self.key]}, own cameras" if self.own_cameras else LABELS[self.key]
+        return stage_label(self.key, own_cameras=self.own_cameras)
 
     def world_points(self) -> np.ndarray:
         """World points (S, H, W, 3) float32; UserError without cameras."""
@@ -153,6 +153,16 @@ class Result:
         return relative_error(self.view_depth(stage, view), self.full["truth"].depth_z[view])
 
 
+def stage_label(key: str, *, own_cameras: bool) -> str:
+    """Return the name of a stage, in reports and videos; `own_cameras` as in `Stage`."""
+    return f"{LABELS[key]}, own cameras" if own_cameras else LABELS[key]
+
+
+def has_other_cameras(summary: Mapping[str, Any]) -> bool:
+    """Whether a result has known or shared cameras, by its reconstruction.json; its frozen prediction has its own."""
+    return bool(summary.get("known_cameras") or summary.get("one_camera"))
+
+
 def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
     """Read an output folder.
 
@@ -184,7 +194,7 @@ def load_result(folder: Path, *, truth: Reconstruction | None = None) -> Result:
     last = list(found)[-1]
     reference = read["truth" if truth else last]
     stages = {}
-    replaced = bool(summary.get("known_cameras") or summary.get("one_camera"))
+    replaced = has_other_cameras(summary)
     for key, place in places.items():
         kept = _kept(read[key], final.depth_z.shape, place, step) if read[key].has_cameras else None
         stage = _stage(key, read[key], reference, read.get("truth"), kept)

@@ -18,7 +18,7 @@ from freegeo import __version__
 from freegeo.data.procedural import get_domain
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import as_json, read_json, write_json, write_tensors
-from freegeo.host import host_available
+from freegeo.host import gigabytes, host_available
 from freegeo.lock import locked
 from freegeo.models.da3 import Backbone
 from freegeo.training.batches import Batch, draw_batch
@@ -121,8 +121,8 @@ def require_memory(config: TrainConfig) -> None:
     needed = config.views_per_step * view
     if needed > free:
         raise UserError(
-            f"a step of {config.views_per_step} views takes about {needed / 1e9:.0f} GB of memory on the CPU, and "
-            f"{free / 1e9:.1f} GB are free. Give --views-per-step {max(2, free // (2 * view))}, or train on a GPU."
+            f"a step of {config.views_per_step} views takes about {gigabytes(needed)} of memory on the CPU, and "
+            f"{gigabytes(free)} are free. Give --views-per-step {max(2, free // (2 * view))}, or train on a GPU."
         )
 
 

@@ -14,10 +14,12 @@ from freegeo.data.video import is_video
 from freegeo.errors import UserError
 from freegeo.export.base import DEFAULT_FORMATS
 from freegeo.export.formats import FORMATS
+from freegeo.host import gigabytes, size_text
 from freegeo.models import catalog
 from freegeo.models.spec import ModelEntry
 from freegeo.report.answer import answer
 from freegeo.report.contents import contents
+from freegeo.report.rendering import duration, fill
 from freegeo.report.result import REPORT_NAME, SUMMARY_NAME
 from freegeo.report.schema import Summary, read_part
 from freegeo.webapp.runs import PHOTOS, ZIP_NAME, Choice, Run
@@ -56,7 +58,7 @@ def models() -> list[ModelEntry]:
 def download_of(item: ModelEntry) -> str:
     """Say how much has to be downloaded for a model."""
     if item.hub_id is not None:
-        return f"{item.download_bytes / 1e9:.1f} GB"
+        return gigabytes(item.download_bytes)
     return "included" if item.packaged_weights else "no download"
 
 
@@ -154,24 +156,10 @@ def files(run: Run) -> Iterator[dict[str, str]]:
     """Give name, size and purpose of the files of a result that can be fetched one by one."""
     order = [REPORT_NAME, *(FORMATS[name].path for name in DEFAULT_FORMATS)]
     there = [path for path in run.result.iterdir() if path.is_file() and not path.name.startswith(".")]
+    about = contents(run.result)
     rank = {name: number for number, name in enumerate(order)}
     for path in sorted(there, key=lambda path: (rank.get(path.name, len(rank)), path.name)):
-        yield {"name": path.name, "size": _size(path.stat().st_size), "about": contents().get(path.name, "")}
-
-
-def _size(count: float) -> str:
-    for unit in ("B", "kB", "MB"):
-        if count < 1000:
-            return f"{count:.0f} {unit}"
-        count /= 1000
-    return f"{count:.1f} GB"
-
-
-def duration(seconds: float) -> str:
-    """Return a time as text: 12 s, 3 min, 1.5 h."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+        yield {"name": path.name, "size": size_text(path.stat().st_size), "about": about.get(path.name, "")}
 
 
 def capital(sentence: str) -> str:
@@ -181,14 +169,8 @@ def capital(sentence: str) -> str:
 
 
 def render(template: str, **values: Any) -> str:
-    """Return a part of the page as HTML; values such as names of files are escaped."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("freegeo.webapp"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True,
-    )  # fmt: skip
-    return environment.get_template(template).render(**values)
+    """Return a part of the page as HTML (`freegeo.report.rendering.fill`)."""
+    return fill(template, package="freegeo.webapp", **values)
 
 
 def build(sessions: Sessions, *, model: str) -> "gr.Blocks":

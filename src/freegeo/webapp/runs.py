@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Literal
 
 from freegeo.export.base import DEFAULT_FORMATS
+from freegeo.host import GRACE_S, bound_to_this_process
 from freegeo.progress import LINES_VARIABLE, read_line
 
 logger = logging.getLogger(__name__)
@@ -36,8 +37,6 @@ ZIP_NAME = f"{ZIPS}.zip"
 """The zip file of a result, in the folder of its run."""
 DONE_CODES = {0, 3}
 """Exit codes of a run whose result is there; 3 with something missing, which the result says."""
-GRACE_S = 20.0
-"""How long a run may take to save its state before it is killed."""
 PROGRESS_LINES = 200
 TEMPORARY = ("TMPDIR", "TEMP", "TMP")
 """Environment variables that name the folder of temporary files."""
@@ -228,12 +227,13 @@ class Queue:
         # What the run puts aside, which may be parts of photos, is removed with it, also when it is killed.
         scratch = run.folder / SCRATCH
         scratch.mkdir(exist_ok=True)
-        environment = {**os.environ, LINES_VARIABLE: str(PROGRESS_LINES), **dict.fromkeys(TEMPORARY, str(scratch))}
+        bound = bound_to_this_process()
+        environment = {**bound["env"], LINES_VARIABLE: str(PROGRESS_LINES), **dict.fromkeys(TEMPORARY, str(scratch))}
         with self._changed:
             if run.stopping:
                 return "cancelled"
             process = run.process = subprocess.Popen(
-                run.command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+                run.command, stdin=bound["stdin"], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
                 encoding="utf-8", errors="replace", env=environment, start_new_session=True,
             )  # fmt: skip
         last: deque[str] = deque(maxlen=_LAST_LINES)
@@ -244,6 +244,8 @@ class Queue:
             run.follow(line.strip())
         code = process.wait()
         _kill(process)
+        assert process.stdin is not None
+        process.stdin.close()
         shutil.rmtree(scratch, ignore_errors=True)
         if run.stopping:
             return "cancelled"

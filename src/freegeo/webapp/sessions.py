@@ -17,8 +17,9 @@ from pathlib import Path
 from freegeo.data.photos import natural_key
 from freegeo.data.video import is_video
 from freegeo.errors import UserError
+from freegeo.host import GRACE_S
 from freegeo.lock import locked
-from freegeo.webapp.runs import GRACE_S, PHOTOS, RESULT, ZIPS, Choice, Queue, Run, command
+from freegeo.webapp.runs import PHOTOS, RESULT, ZIPS, Choice, Queue, Run, command
 
 logger = logging.getLogger(__name__)
 
