@@ -355,6 +355,7 @@ def judged(monkeypatch):
     return told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("state", [(1.0, 1.0), (1.0, 0.5), (0.5, 1.0)])
 def test_the_state_that_the_guard_chose_is_the_adapter(model, tmp_path, judged, state):
     judged |= {"state": State(steps=state[0], strength=state[1]), "outcome": "adapted"}

@@ -57,6 +57,7 @@ def test_program_has_ten_lines():
     assert len(lines) <= 10
 
 
+@pytest.mark.slow
 def test_programs_of_the_python_page_run(photo_folder, capsys):
     parts = programs("docs/python.md")
     assert len(parts) == (ROOT / "docs" / "python.md").read_text().count("```python")

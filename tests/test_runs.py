@@ -16,6 +16,7 @@ def pictures() -> list[np.ndarray]:
     return list((noise(FRAMES).permute(0, 2, 3, 1) * 255).round().byte().numpy())
 
 
+@pytest.mark.slow
 def test_every_photo_is_in_one_piece(tmp_path):
     found = freegeo.reconstruct_sequence(
         tiny_da3(), pictures(), tmp_path / "out", chunk=4, overlap=2, order="given", formats=["tum"]

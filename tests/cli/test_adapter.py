@@ -13,11 +13,11 @@ from freegeo.models.checkpoints import fingerprint
 
 @pytest.fixture(scope="module")
 def adapter(tmp_path_factory, photo_folder, tiny):
-    """An adapter of the embedded model, trained with a rate that changes something in two steps."""
+    """An adapter of the embedded model after a few steps."""
     from freegeo.cli.app import main
 
     folder = tmp_path_factory.mktemp("adapter") / "adapter"
-    assert main(["adapt", str(photo_folder), "-o", str(folder), *tiny, *QUICK, "--lr", "0.003"]) == 0
+    assert main(["adapt", str(photo_folder), "-o", str(folder), *tiny, *QUICK]) == 0
     return folder
 
 

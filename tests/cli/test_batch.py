@@ -273,6 +273,7 @@ def rooms(photo_folder, tmp_path):
     return tmp_path / "rooms"
 
 
+@pytest.mark.slow
 def test_scenes_fail_on_their_own_and_the_same_command_continues(freegeo, here, rooms, photo_folder, tiny, tmp_path):
     out = tmp_path / "out"
     command = ["batch", f"{rooms}/*", "-o", out, *tiny, *FROZEN]

@@ -108,6 +108,7 @@ def test_two_views_of_one_name(unharmed, harmless):
     assert codes == [1]
 
 
+@pytest.mark.slow
 def test_links_in_the_folder(unharmed, tmp_path):
     def change(out: Path, link: str, target: str) -> None:
         (out / link).parent.mkdir(parents=True, exist_ok=True)

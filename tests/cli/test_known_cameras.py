@@ -42,6 +42,7 @@ def summary(folder: Path) -> dict:
     return json.loads((folder / "reconstruction.json").read_text())
 
 
+@pytest.mark.slow
 def test_run_returns_the_given_cameras_and_keeps_what_the_model_predicted(
     freegeo, photo_folder, tiny, file, known, tmp_path
 ):

@@ -32,6 +32,7 @@ def test_a_cut_photo_is_said_in_log_summary_and_report(freegeo, with_portrait, t
     assert (result.offset_xy[:4] == 0).all(), "the others are whole"
 
 
+@pytest.mark.slow
 def test_adaptation_with_padding_runs_and_its_points_are_of_photos(freegeo, with_portrait, tmp_path, tiny):
     out = tmp_path / "out"
     quick = ["--steps", "2", "--sets", "1", "--formats", "ply", "--mixed", "pad", "--drop-share", "0"]

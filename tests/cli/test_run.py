@@ -251,6 +251,7 @@ def test_an_adapter_is_judged_again_by_predictions_of_another_reference_view(fre
     assert (tmp_path / "out" / "adapter" / "freegeo.json").stat().st_mtime_ns != trained
 
 
+@pytest.mark.slow
 def test_an_adapter_that_changes_nothing_gives_the_frozen_result(freegeo, photo_folder, weights, tmp_path, monkeypatch):
     from freegeo.models import da3_config
 
@@ -336,6 +337,7 @@ def test_one_photo_is_enough_to_reconstruct(freegeo, photo_folder, tiny, tmp_pat
 # -- adapt, and reconstruct with its adapter
 
 
+@pytest.mark.slow
 def test_adapter_of_one_scene_gives_the_run_s_result(freegeo, finished, photo_folder, tiny, tmp_path):
     adapter, out = tmp_path / "adapter", tmp_path / "out"
     outcome = freegeo("adapt", photo_folder, "-o", adapter, *tiny, *QUICK)
@@ -361,6 +363,7 @@ def test_several_sources_make_one_adapter(freegeo, photo_folder, tiny, tmp_path)
     assert files(adapter) == ADAPTER_FILES | {f"epochs/epoch_0/{name}" for name in ADAPTER_FILES}
 
 
+@pytest.mark.slow
 def test_retrained_adapter_is_another_option(freegeo, photo_folder, tiny, tmp_path):
     adapter, out = tmp_path / "adapter", tmp_path / "out"
     assert freegeo("adapt", photo_folder, "-o", adapter, *tiny, *QUICK).code == 0
@@ -375,6 +378,7 @@ def test_retrained_adapter_is_another_option(freegeo, photo_folder, tiny, tmp_pa
 
 
 # A run of two steps reads the loss four times: in every step, and after the last without and with the adapter.
+@pytest.mark.slow
 @pytest.mark.parametrize(("stop_after", "left"), [(1, 3), (2, 2), (4, 0)])
 def test_interrupted_run_continues_to_the_same_result(
     freegeo, finished, photo_folder, tiny, tmp_path, monkeypatch, stop_after, left

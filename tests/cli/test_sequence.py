@@ -268,6 +268,7 @@ def test_when_no_chunk_has_an_answer_the_run_fails(freegeo, walk, tiny, tmp_path
     assert not (tmp_path / "out/prediction.npz").exists()
 
 
+@pytest.mark.slow
 def test_run_adapts_once_for_all_chunks(freegeo, walk, tiny, tmp_path):
     out = tmp_path / "out"
     outcome = freegeo(

@@ -7,6 +7,7 @@ from freegeo.cli.options import PhotoOptions
 from freegeo.errors import UserError
 
 
+@pytest.mark.slow
 def test_demo_is_a_source_of_photos(monkeypatch):
     monkeypatch.setattr(sources, "DEMO_FRAMES", 3)
     found = sources.load_source(["demo"], PhotoOptions(max_views=2))

@@ -11,7 +11,6 @@ import torch
 
 import freegeo
 from freegeo.adaptation import memory
-from freegeo.cli.options import SequenceOptions
 from freegeo.data.photos import MemoryPhoto
 from freegeo.errors import UserError
 from freegeo.files import read_json
@@ -19,6 +18,7 @@ from freegeo.models import catalog, da3, da3_images, vggt_images
 from freegeo.models.da3_config import EMBEDDED, SMALL
 from freegeo.models.images import SIDE_FACTOR, chosen_side, look_at_photos, read_photos
 from freegeo.models.precision import Compute
+from freegeo.runs import SequenceWish
 from tiny_models import tiny_da3, tiny_vggt
 
 QUICK = {"steps": 2, "sets": 1, "guard": "off"}
@@ -173,10 +173,10 @@ def test_the_memory_planner_and_chunks_count_the_pixels_that_are_asked_for(monke
     sizes = {side: sum(size for _, size in planned(model, found, side)) for side in (32, 128)}
     budget = sum(sizes.values()) // 2
     monkeypatch.setattr(memory, "available", lambda device, model: budget)
-    options = SequenceOptions(chunk="12")
-    assert options.plan(model, found, "crop", Compute()) is None
+    wish = SequenceWish(chunk=12)
+    assert wish.plan(model, found, Compute()) is None
     with pytest.raises(UserError, match=r"at most .* photos of 128 x 96 pixels fit into memory"):
-        options.plan(model, found, "crop", Compute(), process_res=128)
+        wish.plan(model, found, Compute(), process_res=128)
     with pytest.raises(UserError, match=r"12 images of 128 x 96 pixels .* use at most"):
         freegeo.reconstruct(model, found, process_res=128, device="cpu")
 

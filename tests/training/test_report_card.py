@@ -61,6 +61,7 @@ def test_standing_still_is_far_off(truth):
     assert 10 < zero_motion_rotation_deg(truth) < 90
 
 
+@pytest.mark.slow
 def test_report_card_has_gates_gaps_and_tables(tmp_path):
     model = averaged(new_state(TrainConfig()))
     card = report_card(model, tmp_path / "card.json", side=64, domains={"val-id": 3, "val-light": 2})
