@@ -218,7 +218,7 @@ def test_the_flight_through_an_adapted_result_shows_the_frozen_one_too(
     out, name = tmp_path / "out", "flythrough.mp4"
     done = freegeo("run", photo_folder, "-o", out, *tiny, "--steps", 3, "--guard", "off", "--formats", "video")
     assert done.code == 0, done.err
-    assert width(out / name) == 2 * 256
+    assert width(out / name) == 2 * 384
     assert freegeo("export", out, "-f", "video", "-o", tmp_path / "again").code == 0
     assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()
     filters = {}
@@ -230,7 +230,7 @@ def test_the_flight_through_an_adapted_result_shows_the_frozen_one_too(
         assert freegeo("export", out, "-f", "video", "-o", tmp_path / "thin", "--drop-share", 0.6).code == 0
     assert filters["before"].drop_share == 0.6, "both sides are filtered alike"
     assert freegeo("export", out, "-f", "video", "--frozen").code == 0
-    assert width(out / "frozen" / name) == 256
+    assert width(out / "frozen" / name) == 384
 
 
 def test_a_model_without_cameras_writes_what_needs_none(freegeo, photo_folder, tiny, tmp_path, monkeypatch):
@@ -301,7 +301,7 @@ def test_depth_keeps_the_size_that_a_folder_was_made_with_until_another_is_asked
     assert shapes(tmp_path / "out") == {(96, 128)}
     outcome = freegeo(*again, "--depth-size", "model", "--formats", "depth-npy")
     assert outcome.code == 0 and "already finished" not in outcome.out
-    assert shapes(tmp_path / "out") == {(48, 64)}
+    assert shapes(tmp_path / "out") == {(72, 96)}
     assert "already finished" in freegeo(*again, "--formats", "depth-npy").out
 
 

@@ -106,8 +106,8 @@ def test_cameras_of_rays_are_a_setting_of_the_folder(freegeo, photo_folder, tiny
     head, frozen, adapted = (Reconstruction.load(folder) for folder in (by_head, by_rays / "frozen", by_rays))
     np.testing.assert_array_equal(frozen.depth_z, head.depth_z)
     # The camera head puts every principal point in the middle.
-    assert (head.K[:, :2, 2] == (32, 24)).all()
-    assert (frozen.K[:, :2, 2] != (32, 24)).all() and (adapted.K[:, :2, 2] != (32, 24)).all()
+    assert (head.K[:, :2, 2] == (48, 36)).all()
+    assert (frozen.K[:, :2, 2] != (48, 36)).all() and (adapted.K[:, :2, 2] != (48, 36)).all()
     assert not np.array_equal(frozen.T_cam_world, head.T_cam_world)
     assert (summary(by_rays)["pose_from"], summary(by_head)["pose_from"]) == ("rays", "camera")
     outcome = freegeo("run", photo_folder, "-o", tmp_path / "b", *tiny, "--recipe", "evidence", "--pose-from", "rays")

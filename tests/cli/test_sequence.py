@@ -32,6 +32,8 @@ from freegeo.types import ImageBatch
 
 FRAMES, CHUNK, OVERLAP = 14, 6, 3
 CHUNKS = ["--chunk", str(CHUNK), "--overlap", str(OVERLAP), "--order", "given"]
+SIDE = ["--process-res", "64"]
+"""Of the true predictions, for places in photos."""
 COUNT = 4
 PER_VIEW = ("conf", "images", "photo_hw", "scale_xy", "offset_xy")
 
@@ -341,7 +343,7 @@ def test_chunks_with_known_cameras_stay_where_they_are(freegeo, walk, tiny, tmp_
 def test_a_distance_in_one_piece_leaves_the_others_up_to_scale(freegeo, walk, tiny, tmp_path, oracle):
     oracle.change = lambda number, result: unlike(result) if number == 2 or number >= COUNT else result
     distance = "00.png:10,10 01.png:50,40 = 2"
-    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS, "--scale", distance)
+    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS, *SIDE, "--scale", distance)
     assert outcome.code == 3, outcome.err
     about = told(tmp_path / "out")
     scales = [told(tmp_path / "out" / piece["folder"])["scale"] for piece in about["sequence"]["pieces"]]

@@ -146,7 +146,7 @@ def test_settings_out_of_range_are_refused(small_config, name, value):
 
 def test_a_step_that_the_memory_does_not_hold_is_refused(tmp_path, small_config, monkeypatch):
     monkeypatch.setattr(loop, "host_available", lambda: 10**9)
-    with pytest.raises(UserError, match=r"1024 views takes about 47 GB .* 1.0 GB are free. Give --views-per-step 10"):
+    with pytest.raises(UserError, match=r"1024 views takes about 47.2 GB .* 1.0 GB are free. Give --views-per-step 10"):
         train(replace(small_config, side=96, views_per_step=1024), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
