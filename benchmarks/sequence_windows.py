@@ -24,6 +24,7 @@ from freegeo.adaptation.adapt import adapt
 from freegeo.adaptation.samples import SceneImages
 from freegeo.adaptation.views import chunk_windows
 from freegeo.data.procedural import get_domain, photograph_room
+from freegeo.files import atomic_path
 from freegeo.metrics.scene import evaluate
 from freegeo.models.catalog import load_model
 from freegeo.models.precision import Compute
@@ -48,8 +49,8 @@ def record(file: Path, domain: str, room: int) -> None:
     def score(arm: str) -> None:
         rows = [evaluate(predict(model, batch.select(frames)), scene.select(frames)) for frames in CHUNKS]
         line = {"domain": domain, "room": room, "arm": arm, **{m: [row[m] for row in rows] for m in METRICS}}
-        with file.open("a") as out:
-            out.write(json.dumps(line) + "\n")
+        with atomic_path(file) as part:
+            part.write_text("".join(json.dumps(one) + "\n" for one in [*lines_of(file), line]))
 
     if "frozen" not in there:
         score("frozen")

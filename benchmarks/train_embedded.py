@@ -1,7 +1,8 @@
 """Train the embedded model on a GPU within a time limit: `python benchmarks/train_embedded.py OUT`.
 
 One run with compiled blocks, in a process of its own, which cools down by the end of `--seconds`.
-If that process dies, another goes on from its last saved state without compiled blocks. OUT receives the weights, the
+If that process dies, another goes on from its last saved state without compiled blocks, and may end before the rate has
+fallen to zero. OUT receives the weights, the
 restart file for a later run (`--continue-from`), the log and the settings. Only torch, numpy and safetensors are
 imported.
 """
@@ -26,6 +27,7 @@ from freegeo.training.state import RESTART_FILE, new_state, read_state
 ROOMS_S, SAVING_S = 8.0, 6.0
 """What the first rooms take, and what the files of the end do."""
 SAVE_EVERY_S = 45.0
+SHORTEST_S = 120.0
 
 
 def main() -> None:
@@ -47,6 +49,10 @@ def main() -> None:
     if given.run:
         leg(given)
         return
+    if any(given.output.iterdir()):
+        parser.error(f"{given.output} holds files; name a new folder")
+    if given.seconds < SHORTEST_S:
+        parser.error(f"--seconds {given.seconds:g}: at least {SHORTEST_S:g}, for compilation and the first rooms")
     run = Path(tempfile.mkdtemp()) / "run"
     for compiled in (True, False) if not given.eager else (False,):
         left = given.seconds - (time.monotonic() - begun)
@@ -56,6 +62,8 @@ def main() -> None:
         if code == 0:
             break
         print(f"the process with compiled blocks {compiled} ended with {code}", flush=True)
+    else:
+        sys.exit("no process ended well; what the last one saved is in the output folder")
     print((given.output / loop.LOG).read_text().splitlines()[-1])
 
 

@@ -117,7 +117,9 @@ def test_contradictions_are_compared_with_the_frozen_ones_on_the_same_pixels():
 def test_depth_that_contradicts_itself_more_is_said():
     worse = refinement(True, after={**SCORES, "depth_agreement": 0.8})
     told = answer(summary(recipe=None, refinement=worse)).parts[0].sentence
-    assert told.endswith("in 20 % of the pixels instead of 10 %: they are less exact than the cameras.")
+    assert told.endswith("in 20 % of the pixels (frozen: 10 % of the same ones): they are less exact than the cameras.")
+    as_adapted = refinement(True, before={**SCORES, "depth_agreement": 0.8}, after={**SCORES, "depth_agreement": 0.8})
+    assert answer(summary(recipe=None, refinement=as_adapted)).parts[0].sentence == "Refined so."
     assert answer(summary(recipe=None, refinement=refinement(True))).parts[0].sentence == "Refined so."
 
 

@@ -26,19 +26,20 @@ def train_tiny(
     rooms: int | None = None,
     first_room: int | None = None,
 ) -> None:
-    """Train the embedded model on a GPU; the same command continues, a larger --views goes on from the plateau.
+    """Train the embedded model on a GPU; the same command continues.
 
     Parameters
     ----------
     output
         Folder of the run: state, log, rendered rooms, weights.
     views
-        Views to learn from at most, counted with repetition; default: 9 million.
+        Views to learn from at most, counted with repetition; default: 9 million. With --budget 0 a finished run goes on
+        from the plateau before its cool-down when more are asked for.
     minutes
         Stop this leg after so many minutes; the state is saved.
     budget
-        Minutes that the whole schedule fits in, all legs together: the learning rate reaches zero by then. 0: no limit;
-        default: 8.
+        Minutes that the whole schedule fits in, all legs together: the learning rate reaches zero by then. 0: no limit,
+        and new rooms at fixed steps instead of in a share of the time, so that a CPU repeats a run exactly; default: 8.
     device
         cpu, cuda or cuda:N, for rendering and training; default: cuda where there is one. A CPU learns from a few views
         a second, a GPU from thousands.
@@ -76,6 +77,7 @@ def train_tiny(
         "cooldown": cooldown,
         "rooms": rooms,
         "first_room": first_room,
+        "render_share": 0.0 if budget == 0 else None,
     }
     config = TrainConfig(**{name: value for name, value in given.items() if value is not None})
     chosen = choose_device(device or ("cuda" if torch.cuda.is_available() else "cpu"))

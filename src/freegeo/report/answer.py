@@ -93,13 +93,19 @@ def _refinement(summary: Mapping[str, Any]) -> Iterator[Part]:
     if told:
         more = " The cameras stay as they were predicted."
         if told["accepted"]:
-            after, before = (told["after"].get(key) for key in ("depth_agreement", "depth_agreement_frozen"))
-            more = ""
-            if before is not None and before > after + WORSE:
-                shares = f"{100 * (1 - after):.0f} % of the pixels instead of {100 * (1 - before):.0f} %"
+            more, (before, after) = "", (_excess(told[key]) for key in ("before", "after"))
+            if before is not None and after is not None and after > before + WORSE:
+                own, frozen = (1 - told["after"][key] for key in ("depth_agreement", "depth_agreement_frozen"))
+                shares = f"{100 * own:.0f} % of the pixels (frozen: {100 * frozen:.0f} % of the same ones)"
                 more = f" But depth maps contradict each other more, in {shares}: they are less exact than the cameras."
         outcome: Outcome = "yes" if told["accepted"] else "no"
         yield Part(what="Refinement", outcome=outcome, sentence=told["reason"] + more)
+
+
+def _excess(scores: Mapping[str, float | None]) -> float | None:
+    """Share of the pixels by which a prediction contradicts itself more than the frozen one; None where not known."""
+    own, frozen = (scores.get(key) for key in ("depth_agreement", "depth_agreement_frozen"))
+    return None if own is None or frozen is None else frozen - own
 
 
 def _rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:

@@ -19,8 +19,7 @@ def read_log(path: Path) -> list[dict[str, Any]]:
         raise UserError(f"{path}: no such training log. Give the log.jsonl of a training run.")
     kept: list[dict[str, Any]] = []
     for line in map(json.loads, path.read_text(encoding="utf-8").splitlines()):
-        while kept and kept[-1]["views"] >= line["views"] and kept[-1]["kind"] == line["kind"]:
-            kept.pop()
+        kept = [other for other in kept if other["kind"] != line["kind"] or other["views"] < line["views"]]
         kept.append(line)
     return kept
 

@@ -69,11 +69,11 @@ def train(
     """Train until the schedule is complete or the time limit of this leg is used up; return the weight file.
 
     The same call continues a stopped run: on the CPU, with `minutes=0` and `render_share=0` in the settings, it ends
-    with the same tensors as a run that was never stopped. A larger `views` continues from the plateau before the
-    cool-down. Says so when the time of the schedule was over after a small part of its views.
+    with the same tensors as a run that was never stopped. Without a schedule in time, larger `views` continue from
+    the plateau before the cool-down. Says so when the time of the schedule was over after a small part of its views.
 
     Args:
-        config: settings; only `views` may change when a run is continued.
+        config: settings; when a run is continued, only `views` may grow, and only with `minutes=0`.
         folder: state, log, rendered rooms and weights of the run.
         minutes: time limit of this leg, which leaves the schedule as it is.
         device: where rooms are rendered and the model learns.
@@ -301,12 +301,13 @@ def apply_gradients(state: State, rate: float, config: TrainConfig) -> torch.Ten
 
 
 def keep_settings(config: TrainConfig, folder: Path) -> None:
-    """Store the settings, or refuse to go on with other ones; only the view budget may change."""
+    """Store the settings, or refuse to go on with other ones; only the views may grow, without a schedule in time."""
     settings = as_json(asdict(config))
     path = folder / CONFIG
     if path.is_file():
         before = read_json(path)
-        names = sorted({*settings, *before} - {"views"})
+        may_grow = not config.minutes and config.views >= before.get("views", config.views)
+        names = sorted({*settings, *before} - ({"views"} if may_grow else set()))
         different = [name for name in names if settings.get(name) != before.get(name)]
         if different:
             raise UserError(f"{folder}: holds a training run with another {', '.join(different)}. Choose a new folder.")
