@@ -19,7 +19,7 @@ from freegeo.webapp.server import serving
 FIGURES = Path(__file__).parents[2] / "docs" / "figures"
 PORT, APP_PORT = 8437, 8438
 APP_ROOM, APP_PHOTOS = 1, 12
-"""Photos to which the embedded model adapts with success."""
+"""Photos of which adaptation and refinement have different verdicts."""
 VIEWER_START_MS, SETTLE_MS, RUN_MS = 15_000, 1_500, 300_000
 
 
