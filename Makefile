@@ -13,7 +13,7 @@ test: $(READY)
 	$(PYTEST) -n 2
 
 test-slow: $(READY)
-	$(PYTEST) -m slow
+	$(PYTEST) -n 2 -m slow
 
 test-browser: $(READY)
 	$(PYTEST) -m browser

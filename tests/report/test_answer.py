@@ -111,7 +111,7 @@ def test_a_refined_result_is_the_one_in_use():
 def test_contradictions_are_compared_with_the_frozen_ones_on_the_same_pixels():
     trial = {**WHOLE, "depth_agreement": 0.88, "depth_agreement_frozen": 0.885}
     found = answer(summary(verdict=verdict("adapted", [trial], chosen=0), adapter="adapter"))
-    assert [row[HEADER.index("contradicted pixels, %")] for row in found.rows] == ["10.0", "12.0 (11.5)"]
+    assert [row[HEADER.index("contradicted pixels, %")] for row in found.rows] == ["10.0", "12.0 (frozen: 11.5)"]
 
 
 def test_depth_that_contradicts_itself_more_is_said():

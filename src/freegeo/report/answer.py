@@ -139,7 +139,7 @@ def _cells(scores: Mapping[str, float | None]) -> tuple[str, ...]:
     own, frozen = (None if share is None else f"{100 * (1 - share):.1f}" for share in shares)
     probability = scores.get("probability")
     values = {
-        **scores, "contradicted": own if frozen in (None, own) else f"{own} ({frozen})",
+        **scores, "contradicted": own if frozen in (None, own) else f"{own} (frozen: {frozen})",
         "probability": None if probability is None else 100 * probability,
     }  # fmt: skip
     formats = (
