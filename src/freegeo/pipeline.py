@@ -19,7 +19,7 @@ from freegeo.adaptation.adapt import Adapted, OwnLoss, Progress
 from freegeo.adaptation.adapt import adapt as train_adapter
 from freegeo.adaptation.adapter import Adapter, is_adapted
 from freegeo.adaptation.memory import plan_reconstruction
-from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Guard, Recipe
+from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Guard, Recipe, require_guard
 from freegeo.adaptation.samples import SceneImages
 from freegeo.data.photos import MAX_VIEWS, load_photos
 from freegeo.errors import FreeGeoError, UserError
@@ -30,7 +30,7 @@ from freegeo.export.reconstruction import Reconstruction
 from freegeo.guarded import Evidence, harm, judge_adapter, scene_matches
 from freegeo.metres import in_metres, read_scale
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
-from freegeo.models.catalog import EMBEDDED_MODEL, warn_of_embedded_model
+from freegeo.models.catalog import caution_of
 from freegeo.models.images import read_photos
 from freegeo.models.precision import Compute
 from freegeo.models.spec import MIXED, Mixed, ModelSpec, PoseFrom
@@ -116,12 +116,17 @@ def require_reference(reference: str | None, priors: Priors | None) -> None:
         )
 
 
-def require_pose_from(spec: ModelSpec, pose_from: PoseFrom) -> None:
-    """Raise UserError when cameras cannot come from there."""
+def require_pose_from(spec: ModelSpec, pose_from: PoseFrom, recipe: Recipe | None = None) -> None:
+    """Raise UserError when cameras cannot come from there, or are not those that a recipe teaches."""
     if pose_from not in get_args(PoseFrom):
         raise UserError(f"cameras come from {' or '.join(get_args(PoseFrom))}, not {pose_from!r}.")
     if pose_from == "rays" and not spec.ray_cameras:
         raise UserError(f"{spec.name} finds no cameras from rays; only the any-view models of Depth Anything 3 do.")
+    if pose_from == "rays" and recipe is not None and recipe.cameras:
+        raise UserError(
+            f"recipe {recipe.name} teaches the camera head, which --pose-from rays does not read. Leave out one of "
+            "them."
+        )
 
 
 def capital(sentence: str) -> str:
@@ -372,6 +377,7 @@ def adapt(
         NoEvidenceError: recipe `evidence`, and the matches between the photos prove no cameras.
     """
     require_model(model)
+    require_guard(guard)
     model.adaptable()
     warn_of_model(model)
     compute = Compute.choose(device, precision)
@@ -557,14 +563,10 @@ def require_model(model: object) -> None:
 
 def warn_of_model(model: ReconstructionModel) -> None:
     """Say once what a model is not for, or what its results lack."""
-    name, caution = model.spec.name, model.spec.caution
-    if name in _warned_of or not (caution or name == EMBEDDED_MODEL):
-        return
-    _warned_of.append(name)
-    if caution:
+    name, caution = model.spec.name, caution_of(model.spec)
+    if caution and name not in _warned_of:
+        _warned_of.append(name)
         logger.warning("%s", caution)
-    else:
-        warn_of_embedded_model()
 
 
 def scene_images(

@@ -14,6 +14,7 @@ from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
+from threading import Lock, get_ident
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -153,13 +154,91 @@ def _lines(title: str, total: int) -> Update:
 class Remembering(logging.Handler):
     """Keeps warnings, each once, for the summary and the report of a result."""
 
-    def __init__(self) -> None:
-        """Start without any."""
+    def __init__(self, thread: int | None = None) -> None:
+        """Start without any; with a `thread`, only what that one says is kept."""
         super().__init__(logging.WARNING)
         self.sentences: list[str] = []
+        self._thread = thread
 
     def emit(self, record: logging.LogRecord) -> None:
         """Keep what a record says."""
+        if self._thread not in (None, get_ident()):
+            return
         sentence = record.getMessage()
         if sentence not in self.sentences:
             self.sentences.append(sentence)
+
+
+@contextmanager
+def remembered() -> Generator[list[str]]:
+    """Collect the warnings of the package that this thread gives in the block.
+
+    They are collected whatever level the caller's loggers have, and the caller's handlers get no more than before.
+    """
+    memory, package = Remembering(get_ident()), logging.getLogger("freegeo")
+    _hear_warnings(package)
+    package.addHandler(memory)
+    try:
+        yield memory.sentences
+    finally:
+        package.removeHandler(memory)
+        _hear_as_before()
+
+
+_LISTENING = Lock()
+_blocks = 0
+_levels: dict[logging.Logger, int] = {}
+"""Levels of loggers that are lower while a block of `remembered` runs, in any thread."""
+_filtered: list[logging.Handler] = []
+
+
+def _hear_warnings(package: logging.Logger) -> None:
+    global _blocks
+    with _LISTENING:
+        _blocks += 1
+        if _blocks > 1:
+            return
+        every = [one for one in package.manager.loggerDict.values() if isinstance(one, logging.Logger)]
+        own = [one for one in every if one is package or one.name.startswith(f"{package.name}.")]
+        deaf = {one: one.level for one in own if one.level > logging.WARNING}
+        if package.getEffectiveLevel() > logging.WARNING:
+            deaf[package] = package.level
+        if not deaf:
+            return
+        _filtered[:] = {handler for one in own for handler in _handlers_of(one)}
+        _levels.update(deaf)
+        for handler in _filtered:
+            handler.addFilter(_was_heard)
+        for one in deaf:
+            one.setLevel(logging.WARNING)
+
+
+def _hear_as_before() -> None:
+    global _blocks
+    with _LISTENING:
+        _blocks -= 1
+        if _blocks:
+            return
+        for one, level in _levels.items():
+            one.setLevel(level)
+        for handler in _filtered:
+            handler.removeFilter(_was_heard)
+        _levels.clear()
+        _filtered.clear()
+
+
+def _handlers_of(logger: logging.Logger) -> list[logging.Handler]:
+    """Return the handlers that get what a logger says."""
+    above = _handlers_of(logger.parent) if logger.propagate and logger.parent is not None else []
+    return [*logger.handlers, *above]
+
+
+def _was_heard(record: logging.LogRecord) -> bool:
+    """Whether a record would have been made with the levels that the caller gave to the loggers."""
+    one: logging.Logger | None = logging.getLogger(record.name)
+    while one is not None:
+        level = _levels.get(one, one.level)
+        if level:
+            return record.levelno >= level
+        one = one.parent
+    return True

@@ -7,18 +7,19 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from freegeo.adaptation.adapt import require_unchanged_images
 from freegeo.adaptation.adapter import is_adapted
-from freegeo.adaptation.adapter_files import WEIGHTS, find_adapter, read_peft
+from freegeo.adaptation.adapter_files import WEIGHTS, find_adapter, load_adapter, read_peft
 from freegeo.adaptation.memory import plan_reconstruction
-from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Guard, Recipe, require_seed
+from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Guard, Recipe, require_guard, require_seed
 from freegeo.cameras.undistortion import UndistortedPhoto
 from freegeo.data.photos import all_of, doubt_blank, some_of
 from freegeo.data.video import VideoFrame
@@ -29,12 +30,13 @@ from freegeo.export.formats import check_formats
 from freegeo.export.photos import FOLDER as COPIES_FOLDER
 from freegeo.export.photos import write_copies
 from freegeo.export.reconstruction import Reconstruction
-from freegeo.files import read_json
+from freegeo.files import ledger, read_json
 from freegeo.fusion.settings import FilterSettings
 from freegeo.host import gigabytes
 from freegeo.job import MATCHES_NAME, PARTS, SUMMARY_NAME, Hooks, Job
 from freegeo.metres import read_scale, require_in_view
-from freegeo.models.checkpoints import fingerprint
+from freegeo.models.catalog import caution_of
+from freegeo.models.checkpoints import fingerprint, fingerprint_of
 from freegeo.models.images import chosen_side, look_at_photos, read_photos, read_some
 from freegeo.models.precision import Compute
 from freegeo.models.reference import require_no_choice, require_rule
@@ -48,8 +50,8 @@ from freegeo.pipeline import (
     warn_of_model,
 )
 from freegeo.posed import check_known, digest, is_one_camera, known_cameras, require_cameras, told, told_in_chunks
-from freegeo.progress import Remembering, step_bar
-from freegeo.run_folder import run_folder, stored_state
+from freegeo.progress import remembered, step_bar
+from freegeo.run_folder import check_folder, run_folder, stored_state
 from freegeo.sequence.chunks import OVERLAP, OrderRule, plan_chunks
 from freegeo.sequence_job import SEQUENCE_PARTS, Plan, SequenceJob
 
@@ -109,8 +111,10 @@ class SequenceWish:
     def check(self) -> None:
         """Raise UserError for values of a caller that are no numbers of photos, or no rule."""
         for name, value in (("chunk", self.chunk), ("overlap", self.overlap)):
-            if value is not None and (not isinstance(value, int) or isinstance(value, bool)):
+            if value is not None and (not isinstance(value, Integral) or isinstance(value, bool)):
                 raise UserError(f"{name} is a number of photos, or None, not {value!r}.")
+        if not isinstance(self.loops, bool):
+            raise UserError(f"loops is True or False, not {self.loops!r}.")
         if self.order not in get_args(OrderRule):
             raise UserError(f"order is {', '.join(get_args(OrderRule))}, not {self.order!r}.")
 
@@ -131,13 +135,20 @@ class SequenceWish:
         """
         count, image_hw = len(photos), read_some(model, photos, [0], mixed, process_res).image_hw
         _, fitting = plan_reconstruction(model, 1, image_hw, compute=compute)
-        size = (before or min(fitting, model.spec.chunk)) if self.chunk is None else self.chunk
+        size = (before or min(fitting, model.spec.chunk)) if self.chunk is None else int(self.chunk)
         if min(size, count) > fitting:
-            raise UserError(
-                f"--chunk {size}: at most {fitting} photos of {image_hw[1]} x {image_hw[0]} pixels fit into memory "
-                f"together with {model.spec.name}. Take --chunk {fitting}."
+            fit = (
+                f"at most {fitting} photos of {image_hw[1]} x {image_hw[0]} pixels fit into memory together with "
+                f"{model.spec.name}"
             )
-        overlap = max(1, int(size * OVERLAP)) if self.overlap is None else self.overlap
+            if self.chunk is None:
+                raise UserError(
+                    f"the run in the output folder predicts {min(size, count)} photos together, and {fit} here. "
+                    "Continue it where there is as much memory as before, choose another folder, or replace it "
+                    "(--overwrite)."
+                )
+            raise UserError(f"--chunk {size}: {fit}. Take --chunk {fitting}.")
+        overlap = max(1, int(size * OVERLAP)) if self.overlap is None else int(self.overlap)
         if len(plan_chunks(count, size, overlap)) == 1:
             return None
         if not model.spec.cameras:
@@ -369,14 +380,64 @@ def _placing_settings(found: Inputs, *, trusted: bool) -> dict[str, Any]:
     return {"placing": values} if any(values.values()) else {}
 
 
+def identity(model: str, checkpoint: str, compute: Compute, recipe: Recipe | None, seed: int) -> dict[str, object]:
+    """Return what identifies model, weights, precision and seed in the settings of a folder.
+
+    Args:
+        model: its name.
+        checkpoint: fingerprint of the weights.
+        compute: says the precision that was asked for.
+        recipe: of the adaptation, which may prefer another precision.
+        seed: of everything random.
+    """
+    return {
+        "model": model,
+        "checkpoint": checkpoint,
+        "precision": compute.precision,
+        "adapting_precision": None if recipe is None else compute.preferring(recipe.precision).precision,
+        "seed": seed,
+    }
+
+
 def adapter_identity(folder: Path) -> dict[str, str]:
     """Return what identifies an adapter; UserError when the folder holds none."""
     read_peft(folder)
     return {"folder": str(folder.resolve()), "weights": fingerprint(folder / WEIGHTS)}
 
 
+def check_place(output: Path, *, overwrite: bool) -> None:
+    """Refuse a folder that cannot be used whatever the settings are, before anything is loaded or downloaded."""
+    if stored_state(output) is None:
+        check_folder(output, {}, overwrite=overwrite)
+
+
+def check_inputs(output: Path, photos: Iterable[PhotoLike], *others: object) -> None:
+    """Refuse to overwrite a folder that holds, as files of freegeo, what is read for its new content.
+
+    Args:
+        output: the folder.
+        photos: that are read.
+        *others: other files and folders that are read; what is no path, such as None, is passed over.
+    """
+    out = output.resolve()
+    own = {(out / name).resolve() for name in ledger(out)}
+    own |= {folder for file in own for folder in file.parents if folder.is_relative_to(out)}
+    inputs = [*(getattr(photo, "path", None) for photo in photos), *others]
+    paths = [Path(path) for path in inputs if isinstance(path, str | Path)]
+    taken = next((path for path in paths if path.expanduser().resolve() in own), None)
+    if taken is not None:
+        raise UserError(f"{taken}: it is read, and --overwrite would remove it. Choose another output folder.")
+
+
 def run_in_folder(
-    output: Path, settings: Mapping[str, Any], found: Inputs, *, overwrite: bool, trusted: bool, **job: Any
+    output: Path,
+    settings: Mapping[str, Any],
+    found: Inputs,
+    *,
+    overwrite: bool,
+    trusted: bool,
+    checkpoint: Callable[[], Mapping[str, Any] | None],
+    **job: Any,
 ) -> tuple[dict[str, Any], str | None]:
     """Start or continue a run in its folder; one that is finished is not changed.
 
@@ -386,6 +447,8 @@ def run_in_folder(
         found: the photos.
         overwrite: replace what an earlier run with other settings wrote.
         trusted: known poses are not checked by matches.
+        checkpoint: gives what a `Job` takes as checkpoint; called where the folder is not finished, since it may read
+            the whole weight file.
         **job: what else a `Job` takes.
 
     Returns:
@@ -408,7 +471,8 @@ def run_in_folder(
         kind = Job if found.chunks is None else partial(SequenceJob, plan=found.chunks)
         work = kind(
             folder=folder, photos=found.photos, batch=found.batch, masks=found.masks, known=found.known,
-            priors=found.priors, one_camera=found.one_camera, scale=found.scale, **job,
+            priors=found.priors, one_camera=found.one_camera, scale=found.scale, checkpoint=checkpoint(),
+            **job,
         )  # fmt: skip
         try:
             return work.run(), None
@@ -526,6 +590,7 @@ def reconstruct_sequence(
         raise UserError("the model carries an adapter; detach it, and give the folder of a saved one as adapter.")
     require_pose_from(model.spec, pose_from)
     require_seed(seed)
+    require_guard(guard)
     wish = SequenceWish(chunk=chunk, overlap=overlap, order=order, loops=loops)
     wish.check()
     if reference is not None:
@@ -542,15 +607,28 @@ def reconstruct_sequence(
         require_cameras(model.spec)
     compute, folder = Compute.choose(device, precision), Path(output).expanduser()
     process_res = chosen_side(model.spec, process_res)
-    with _remembered() as warned:
+    check_place(folder, overwrite=overwrite)
+    saved = None if adapter is None else find_adapter(adapter)
+    if saved is not None:
+        # One that does not fit is refused before a result gives way.
+        load_adapter(model, saved).detach()
+    with remembered() as warned:
         warn_of_model(model)
+        if (caution := caution_of(model.spec)) and caution not in warned:
+            # It is logged once in a process, and belongs to every result.
+            warned.append(caution)
         plan = None
         if recipe is not None:
             model.adaptable()
             plan = named_recipe(recipe, model, None)
+            require_pose_from(model.spec, pose_from, plan)
+            if plan.cameras:
+                pycolmap_module()
         seen, known = all_of(photos, max_views, fps=fps), None
         if plan is not None:
             require_enough_photos(seen)
+        if overwrite:
+            check_inputs(folder, seen, saved, cameras, scale)
         if cameras is not None:
             seen, known = known_cameras(seen, cameras)
         written = check_formats(formats, [photo.name for photo in seen], has_cameras=model.spec.cameras)
@@ -558,12 +636,11 @@ def reconstruct_sequence(
             seen, model, plan, wish, compute, known=known, mixed=mixed, process_res=process_res, reference=reference,
             scale=scale, one_camera=one_camera, before=None if overwrite else together_before(folder),
         )  # fmt: skip
-        saved = None if adapter is None else find_adapter(adapter)
         points = filters or FilterSettings()
         settings = settings_of(
-            found, model.spec, plan, command="reconstruct_sequence", model=_identity(model, compute, plan, seed),
-            adapter=saved, guard=guard, reference=reference, pose_from=pose_from, trusted=trust_cameras, refine=refine,
-            filters=asdict(points), formats=written,
+            found, model.spec, plan, command="reconstruct_sequence", adapter=saved, guard=guard, reference=reference,
+            model=identity(model.spec.name, fingerprint_of(model), compute, plan, seed), pose_from=pose_from,
+            trusted=trust_cameras, refine=refine, filters=asdict(points), formats=written,
         )  # fmt: skip
         with step_bar() if progress else nullcontext(lambda step: None) as on_step:
             summary, _ = run_in_folder(
@@ -571,7 +648,7 @@ def reconstruct_sequence(
                 spec=model.spec, recipe=plan, adapter=saved, guard=guard, seed=seed, compute=compute,
                 hooks=Hooks(stage=_said if progress else lambda stage: None, step=on_step), reference=reference,
                 warnings=warned, formats=written, filters=points, refine=refine, pose_from=pose_from,
-                checkpoint=None if model.loaded_from is None else model.loaded_from.weights(),
+                checkpoint=lambda: None if model.loaded_from is None else model.loaded_from.weights(),
             )  # fmt: skip
     pieces = [part["folder"] for part in summary["sequence"]["pieces"]] if "sequence" in summary else ["."]
     return SequenceResult(
@@ -581,25 +658,3 @@ def reconstruct_sequence(
 
 def _said(stage: str) -> None:
     logger.info("%s ...", stage)
-
-
-@contextmanager
-def _remembered() -> Generator[list[str]]:
-    """Collect the warnings of the package, for the summary and the report."""
-    memory, package = Remembering(), logging.getLogger("freegeo")
-    package.addHandler(memory)
-    try:
-        yield memory.sentences
-    finally:
-        package.removeHandler(memory)
-
-
-def _identity(model: ReconstructionModel, compute: Compute, recipe: Recipe | None, seed: int) -> dict[str, object]:
-    loaded = model.loaded_from
-    return {
-        "model": model.spec.name,
-        "checkpoint": None if loaded is None else loaded.fingerprint,
-        "precision": compute.precision,
-        "adapting_precision": None if recipe is None else compute.preferring(recipe.precision).precision,
-        "seed": seed,
-    }

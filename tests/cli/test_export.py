@@ -421,5 +421,5 @@ def test_photos_are_not_overwritten_by_their_own_result(freegeo, out, photo_fold
     before = files(out)
     outcome = freegeo(command, out / "images", "-o", out, *tiny, "--overwrite")
     assert outcome.code == 2
-    assert "the command reads it, and --overwrite would remove it" in outcome.sentence()
+    assert "it is read, and --overwrite would remove it" in outcome.sentence()
     assert files(out) == before

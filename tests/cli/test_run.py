@@ -558,5 +558,5 @@ def test_an_adapter_is_not_overwritten_by_the_result_that_it_is_for(freegeo, fin
     before = files(out)
     outcome = freegeo("reconstruct", photo_folder, "--adapter", out, "-o", out, *tiny, "--overwrite")
     assert outcome.code == 2
-    assert "the command reads it, and --overwrite would remove it" in outcome.sentence()
+    assert "it is read, and --overwrite would remove it" in outcome.sentence()
     assert files(out) == before

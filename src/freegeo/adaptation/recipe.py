@@ -280,6 +280,12 @@ def require_seed(seed: int) -> None:
         raise UserError(f"--seed must be from 0 to 2^64 - 1, got {seed}.")
 
 
+def require_guard(guard: object) -> None:
+    """Raise UserError for something that is no `Guard`."""
+    if guard not in get_args(Guard):
+        raise UserError(f"guard is {', '.join(get_args(Guard))}, not {guard!r}.")
+
+
 class DatasetRow(NamedTuple):
     """One row of a published table, in the names of `Recipe`."""
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
-from freegeo.cli.jobs import check_inputs, check_place, say_finished
+from freegeo.cli.jobs import say_finished
 from freegeo.cli.options import CameraOptions, ModelOptions, OutputOptions, PhotoOptions, RecipeOptions
 from freegeo.cli.sources import load_source, split_scenes
 from freegeo.progress import step_bar
@@ -61,16 +61,17 @@ def adapt(
     from freegeo.pipeline import require_enough_photos, scene_images
     from freegeo.posed import check_known, told
     from freegeo.run_folder import run_folder
-    from freegeo.runs import LABELS, size_settings
+    from freegeo.runs import LABELS, check_inputs, check_place, size_settings
 
-    check_place(output)
+    check_place(output.output, overwrite=output.overwrite)
     empty = model.build_empty()
     empty.adaptable()
     chosen_side(empty.spec, photos.process_res)
     plan = recipe.build(empty.spec)
     photos = replace(photos, max_views=MAX_VIEWS if photos.max_views is None else photos.max_views)
     scenes = {str(part[0]): load_source(part, photos) for part in split_scenes(sources)}
-    check_inputs(output, [photo for found in scenes.values() for photo in found], cameras.cameras)
+    if output.overwrite:
+        check_inputs(output.output, [photo for found in scenes.values() for photo in found], cameras.cameras)
     model.warn_of_embedded(sources)
     for found in scenes.values():
         require_enough_photos(found)

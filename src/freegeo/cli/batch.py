@@ -22,7 +22,7 @@ from freegeo.adaptation.recipe import Guard
 from freegeo.cli import console
 from freegeo.cli.export import stored_summary
 from freegeo.cli.files import FileOptions
-from freegeo.cli.jobs import DEFAULT_FILES, check_place, planned
+from freegeo.cli.jobs import DEFAULT_FILES, planned
 from freegeo.cli.options import (
     ModelOptions,
     OutputOptions,
@@ -150,7 +150,7 @@ def batch(
     model.warn_of_embedded([source for scene in named for source in scene.sources])
     from freegeo.runs import adapter_identity
 
-    common = [model.checkpoint_identity["fingerprint"], None if adapter is None else adapter_identity(adapter)]
+    common = [model.fingerprint, None if adapter is None else adapter_identity(adapter)]
     options = [*as_arguments(model), *as_arguments(placing), *as_arguments(sequence), *as_arguments(files)]
     options += [f"--refine={refine}", f"--pose-from={pose_from}"]
     if adapter is not None:
@@ -187,12 +187,14 @@ def as_arguments(options: Any) -> list[str]:
 
 def _check_output(out: Path, scenes: Sequence[NamedScene]) -> None:
     """Refuse places for results that cannot be used."""
+    from freegeo.runs import check_place
+
     state = stored_state(out) if out.is_dir() else None
     if state is not None and state["settings"] != SETTINGS:
         raise UserError(f"{out}: holds the result of another command. Choose another folder (--output).")
     check_folder(out, SETTINGS, overwrite=False)
     for scene in scenes:
-        check_place(OutputOptions(output=out / scene.name))
+        check_place(out / scene.name, overwrite=False)
 
 
 def _look_at_all(

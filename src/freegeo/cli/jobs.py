@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,11 +22,9 @@ from freegeo.cli.options import (
     refines_with,
 )
 from freegeo.errors import UserError
-from freegeo.files import ledger
 from freegeo.models.spec import MIXED, Mixed, PoseFrom
 from freegeo.progress import step_bar
 from freegeo.report.contents import contents
-from freegeo.run_folder import check_folder, stored_state
 
 if TYPE_CHECKING:
     from freegeo.adaptation.recipe import Recipe
@@ -78,10 +76,11 @@ def run_job(
     from freegeo.models.images import chosen_side
     from freegeo.pipeline import require_enough_photos
     from freegeo.posed import undistorted_masks
-    from freegeo.runs import read_inputs, run_in_folder, settings_of, together_before
+    from freegeo.runs import check_inputs, check_place, read_inputs, run_in_folder, settings_of, together_before
 
-    check_place(output)
-    check_inputs(output, photos, adapter, cameras.cameras)
+    check_place(output.output, overwrite=output.overwrite)
+    if output.overwrite:
+        check_inputs(output.output, photos, adapter, cameras.cameras, files.filters.masks, placing.scale)
     empty = model_options.build_empty()
     process_res = chosen_side(empty.spec, process_res)
     formats = files.all_formats(output, photos, has_cameras=empty.spec.cameras)
@@ -111,7 +110,7 @@ def run_job(
             output.output, settings, found, overwrite=output.overwrite, trusted=cameras.trust_cameras,
             load=model_options.load, spec=empty.spec, recipe=plan, seed=model_options.seed, compute=compute,
             hooks=hooks, command=console.command_line(), warnings=console.warned(), after=after,
-            filters=files.filters.settings(), checkpoint=model_options.origin(), **same,
+            filters=files.filters.settings(), checkpoint=model_options.origin, **same,
         )  # fmt: skip
     if finished_at is not None:
         say_finished(output.output, finished_at)
@@ -146,32 +145,8 @@ def planned(
         return None, refining
     empty.adaptable()
     plan = recipe.build(empty.spec)
-    if plan.cameras and pose_from == "rays":
-        raise UserError(
-            f"recipe {plan.name} teaches the camera head, which --pose-from rays does not read. Leave out one of them."
-        )
+    require_pose_from(empty.spec, pose_from, plan)
     return plan, refining
-
-
-def check_place(output: OutputOptions) -> None:
-    """Refuse a folder that cannot be used whatever the settings are, before anything is loaded or downloaded."""
-    if stored_state(output.output) is None:
-        check_folder(output.output, {}, overwrite=output.overwrite)
-
-
-def check_inputs(output: OutputOptions, photos: Iterable[PhotoLike], *others: Path | None) -> None:
-    """Refuse to remove with --overwrite the photos, or other files and folders, that the command reads."""
-    if not output.overwrite:
-        return
-    out = output.output.resolve()
-    own = {(out / name).resolve() for name in ledger(out)}
-    own |= {folder for file in own for folder in file.parents if folder.is_relative_to(out)}
-    inputs = [*(getattr(photo, "path", None) for photo in photos), *others]
-    taken = next((path for path in inputs if isinstance(path, Path) and path.resolve() in own), None)
-    if taken is not None:
-        raise UserError(
-            f"{taken}: the command reads it, and --overwrite would remove it. Choose another output folder."
-        )
 
 
 def say_finished(folder: Path, finished_at: str | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,9 +17,11 @@ from freegeo.adaptation.recipe import PAPER, SEED, DatasetName, Recipe, RecipeNa
 from freegeo.cli import console
 from freegeo.cli.sources import DEMO
 from freegeo.errors import UserError
-from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_MODEL, entry, warn_of_embedded_model
+from freegeo.models.catalog import DEFAULT_MODEL, EMBEDDED_CAUTION, EMBEDDED_MODEL, entry
 from freegeo.models.spec import MIXED, Mixed
 from freegeo.sequence.chunks import OrderRule
+
+logger = logging.getLogger(__name__)
 
 Refine = Literal["auto", "ba", "off"]
 """Whether bundle adjustment of matches between the photos follows (docs/refinement.md); `auto`: where its extra is
@@ -68,7 +71,7 @@ class ModelOptions:
     def warn_of_embedded(self, sources: Sequence[str]) -> None:
         """Say what the embedded model is not for, when it is used on photos other than the demo's."""
         if self.name == EMBEDDED_MODEL and any(source != DEMO for source in sources):
-            warn_of_embedded_model()
+            logger.warning("%s", EMBEDDED_CAUTION)
 
     def load(self) -> ReconstructionModel:
         """Load the model."""
@@ -106,12 +109,11 @@ class ModelOptions:
         return weights_file(self.name, self.checkpoint)
 
     @cached_property
-    def checkpoint_identity(self) -> dict[str, str]:
-        """Name of the weight file and a fingerprint of its content, looked up (and downloaded) once."""
+    def fingerprint(self) -> str:
+        """Fingerprint of the weight file, which is looked up (and downloaded) once."""
         from freegeo.models.checkpoints import fingerprint
 
-        path = self.weights()
-        return {"file": path.name, "fingerprint": fingerprint(path)}
+        return fingerprint(self.weights())
 
     def origin(self) -> dict[str, Any]:
         """Return what reconstruction.json says of the weights; local ones are read whole, for their SHA-256."""
@@ -121,14 +123,9 @@ class ModelOptions:
 
     def identity(self, recipe: Recipe | None) -> dict[str, object]:
         """Return what a result depends on, for comparison with an existing folder."""
-        compute = self.compute()
-        return {
-            "model": self.name,
-            "checkpoint": self.checkpoint_identity["fingerprint"],
-            "precision": compute.precision,
-            "adapting_precision": None if recipe is None else compute.preferring(recipe.precision).precision,
-            "seed": self.seed,
-        }
+        from freegeo.runs import identity
+
+        return identity(self.name, self.fingerprint, self.compute(), recipe, self.seed)
 
 
 @Parameter(name="*")

@@ -43,6 +43,8 @@ NO_CAMERAS = "this reconstruction has no cameras, so it has no 3D points. Use a 
 def chosen_formats(names: Iterable[str]) -> list[str]:
     """Return the names of the chosen formats, each once, `all` resolved; a name may be several with commas.
 
+    A string is one name.
+
     UserError for one that does not exist, and when none is named.
     """
     asked = _single(names)
@@ -56,6 +58,7 @@ def chosen_formats(names: Iterable[str]) -> list[str]:
 
 
 def _single(names: Iterable[str]) -> list[str]:
+    names = [names] if isinstance(names, str) else names
     return [part.strip().lower() for name in names for part in name.split(",") if part.strip()]
 
 

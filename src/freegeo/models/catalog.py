@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from freegeo.errors import FreeGeoError, UserError
-from freegeo.models.spec import LoadedFrom, ModelEntry
+from freegeo.models.spec import LoadedFrom, ModelEntry, ModelSpec
 
 if TYPE_CHECKING:
     from freegeo.models.api import ReconstructionModel
@@ -25,6 +25,11 @@ FAMILIES = (
 """Modules, free of torch, that list their models in `ENTRIES`; a new backbone of the package is named here."""
 DEFAULT_MODEL = "da3-base"
 EMBEDDED_MODEL = "freegeo-tiny"
+EMBEDDED_CAUTION = (
+    f"{EMBEDDED_MODEL} was trained on generated rooms at 96 x 72 pixels, for demonstrations and tests: on real photos "
+    f"its cameras are mostly wrong (AUC@30 of 0 to .29); use {DEFAULT_MODEL} or another model of `freegeo models`."
+)
+"""What the embedded model is not for."""
 _SHOWN = 200
 """Most characters of the error of a plug-in that a message shows."""
 PLUGIN_GROUP = "freegeo.models"
@@ -84,13 +89,9 @@ def for_each(make: Callable[[str], T]) -> list[T]:
     return found
 
 
-def warn_of_embedded_model() -> None:
-    """Warn that the embedded model is not for real photos."""
-    logger.warning(
-        "%s was trained on generated rooms at 96 x 72 pixels, for demonstrations and tests: on real photos its cameras "
-        "are mostly wrong (AUC@30 of 0 to .29); use %s or another model of `freegeo models`.",
-        EMBEDDED_MODEL, DEFAULT_MODEL,
-    )  # fmt: skip
+def caution_of(spec: ModelSpec) -> str | None:
+    """Return a sentence on what a model is not for, or what its results lack; None for nothing of the kind."""
+    return spec.caution or (EMBEDDED_CAUTION if spec.name == EMBEDDED_MODEL else None)
 
 
 def build_empty(name: str) -> ReconstructionModel:

@@ -384,6 +384,15 @@ def fingerprint(path: Path) -> str:
     return digest.hexdigest()[:16]
 
 
+def fingerprint_of(model: nn.Module) -> str:
+    """Identify the weights that a model has now, wherever they came from: names, shapes, types and every number."""
+    digest = hashlib.blake2b(digest_size=8)
+    for name, tensor in model.state_dict().items():
+        digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}\n".encode())
+        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
 def sha256_of_parts(path: Path) -> dict[str, str]:
     """Return the SHA-256 of a checkpoint's files by their names; a file is read again when it has changed."""
     return {part.name: _sha256(part, part.stat().st_mtime_ns) for part in parts_of(path)}
