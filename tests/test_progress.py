@@ -1,6 +1,9 @@
 """Progress: a bar where it can be drawn, lines elsewhere, and time left that does not count what was done before."""
 
+import io
+import logging
 import sys
+from threading import Thread
 from types import SimpleNamespace
 
 import pytest
@@ -115,3 +118,32 @@ def test_a_run_that_fails_leaves_no_bar_behind(monkeypatch):
         assert sys.stderr.text.count(hidden) > sys.stderr.text.count(visible)
         raise RuntimeError
     assert sys.stderr.text.count(hidden) == sys.stderr.text.count(visible)
+
+
+@pytest.mark.parametrize("deaf", ["freegeo", "freegeo.runs", ""])
+def test_warnings_are_collected_whatever_the_levels_and_shown_as_before(monkeypatch, deaf):
+    shown, package, speaker = io.StringIO(), logging.getLogger("freegeo"), logging.getLogger("freegeo.runs")
+    monkeypatch.setattr(package, "handlers", [logging.StreamHandler(shown)])
+    monkeypatch.setattr(package, "propagate", True)
+    quiet, before = logging.getLogger(deaf), {}
+    for logger in (package, speaker, quiet):
+        before[logger] = logger.level
+        logger.setLevel(logging.NOTSET)
+    quiet.setLevel(logging.ERROR)
+    try:
+        with progress.remembered() as warned:
+            speaker.warning("doubtful")
+            speaker.error("broken")
+            other = Thread(target=lambda: speaker.warning("of another thread"))
+            other.start()
+            other.join()
+            with progress.remembered():
+                pass
+            speaker.warning("again")
+        speaker.warning("afterwards")
+        assert warned == ["doubtful", "broken", "again"]
+        assert shown.getvalue() == "broken\n" and quiet.level == logging.ERROR
+        assert not package.handlers[0].filters
+    finally:
+        for logger, level in before.items():
+            logger.setLevel(level)

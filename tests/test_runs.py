@@ -1,13 +1,26 @@
 """Runs into folders from Python: what they return, and that the model is as it was."""
 
+import io
+import logging
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import freegeo
+from freegeo import runs
+from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapter import is_adapted
+from freegeo.adaptation.adapter_files import load_adapter, save_adapter
 from freegeo.errors import UserError
-from tiny_models import noise, quick, same, tiny_da3
+from freegeo.files import atomic_path, write_json
+from freegeo.models.checkpoints import fingerprint_of
+from freegeo.run_folder import run_folder
+from tiny_models import attach, noise, quick, same, tiny_da3, tiny_nested, tiny_vggt
 
 FRAMES = 5
 
@@ -52,6 +65,8 @@ def test_photos_that_fit_are_predicted_at_once_as_by_reconstruct(tmp_path):
         ({"recipe": "scene", "adapter": "adapter"}, "Leave out one of them"),
         ({"chunk": "auto"}, "chunk is a number of photos, or None"),
         ({"chunk": 0}, "--chunk must be at least 2"),
+        ({"loops": "no"}, "loops is True or False, not 'no'"),
+        ({"guard": "foo"}, "guard is select, report, off, not 'foo'"),
         ({"order": "name"}, "order is auto, given, similar"),
         ({"refine": True, "cameras": "cameras.json"}, "Leave out refine or cameras"),
     ],
@@ -60,3 +75,90 @@ def test_what_cannot_be_is_refused_and_nothing_is_written(tmp_path, wrong, words
     with pytest.raises(UserError, match=words):
         freegeo.reconstruct_sequence(tiny_da3(), pictures(), tmp_path / "out", **wrong)
     assert not (tmp_path / "out").exists()
+
+
+def test_numbers_of_numpy_are_numbers_of_photos():
+    runs.SequenceWish(chunk=np.int64(3), overlap=np.int64(1)).check()  # ty: ignore[invalid-argument-type]
+
+
+def test_a_recipe_that_teaches_cameras_is_refused_where_they_come_from_rays(tmp_path):
+    model = tiny_nested()
+    with pytest.raises(UserError, match="recipe evidence teaches the camera head"):
+        freegeo.reconstruct_sequence(
+            model, pictures(), tmp_path / "out", recipe=recipes.named("evidence", model.spec), pose_from="rays"
+        )
+    assert not (tmp_path / "out").exists()
+
+
+def write_adapter(model, folder: Path) -> Path:
+    adapter = attach(model)
+    save_adapter(adapter, folder, {})
+    adapter.detach()
+    return folder
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.mark.parametrize(
+    "read", ["own adapter", "own photos", "adapter of another model", "adapter of nobody knows what"]
+)
+def test_nothing_is_removed_for_a_run_that_is_refused(tmp_path, read):
+    out, model = tmp_path / "out", tiny_da3()
+    with run_folder(out, {"command": "reconstruct"}) as run:
+        write_json(run / "reconstruction.json", {})
+        write_adapter(model, run / "adapter")
+        for k, picture in enumerate(pictures()):
+            with atomic_path(run / f"images/{k}.png") as part:
+                Image.fromarray(picture).save(part, format="png")
+        run.finish()
+    other = write_adapter(tiny_vggt(), tmp_path / "other")
+    if read.endswith("what"):
+        (other / "freegeo.json").unlink()
+    photos = out / "images" if read == "own photos" else pictures()
+    adapter = {"own adapter": out, "own photos": None}.get(read, other)
+    before = contents(out)
+    with pytest.raises(UserError, match=r"--overwrite would remove it|made for tiny-vggt|belongs to another model"):
+        freegeo.reconstruct_sequence(model, photos, out, adapter=adapter, overwrite=True)
+    assert contents(out) == before and not is_adapted(model)
+    load_adapter(model, out)
+
+
+def test_weights_are_told_apart_wherever_they_came_from():
+    model = tiny_da3()
+    before = fingerprint_of(model)
+    assert before == fingerprint_of(tiny_da3()) != fingerprint_of(tiny_da3(seed=1))
+    next(iter(model.parameters())).data.view(-1)[-1] += 1e-3
+    assert fingerprint_of(model) != before
+
+
+def test_a_result_knows_its_weights_and_has_every_warning_whatever_the_caller_logs(tmp_path, monkeypatch, caplog):
+    shown, package, model = io.StringIO(), logging.getLogger("freegeo"), tiny_da3()
+    monkeypatch.setattr(package, "handlers", [logging.StreamHandler(shown)])
+    caplog.set_level(logging.ERROR, logger="freegeo")
+    model.spec = replace(model.spec, caution="Depth is a guess.")
+    black = [np.zeros_like(picture) for picture in pictures()[:2]]
+    for name in ("first", "second"):
+        found = freegeo.reconstruct_sequence(model, black, tmp_path / name, formats=["tum"], device="cpu")
+        assert found.summary["warnings"][0] == "Depth is a guess."
+        assert any("almost black" in sentence for sentence in found.summary["warnings"])
+    assert not shown.getvalue() and package.level == logging.ERROR
+    model.load_state_dict(tiny_da3(seed=1).state_dict())
+    with pytest.raises(UserError, match="other weights"):
+        freegeo.reconstruct_sequence(model, black, tmp_path / "first", formats=["tum"], device="cpu")
+
+
+def test_a_finished_folder_needs_no_look_at_the_weights(tmp_path):
+    with run_folder(tmp_path / "out", {}) as run:
+        write_json(run / "reconstruction.json", {"images": []})
+        run.finish()
+    found = SimpleNamespace(known=None, chunks=None, photos=[])
+
+    def read() -> None:
+        raise AssertionError("the weight file was read")
+
+    summary, finished_at = runs.run_in_folder(
+        tmp_path / "out", {}, found, overwrite=False, trusted=False, checkpoint=read
+    )  # ty: ignore[invalid-argument-type]
+    assert finished_at and summary == {"images": []}

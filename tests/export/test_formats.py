@@ -358,3 +358,7 @@ def test_masks_of_another_size_are_refused():
         masks_for_model(scene, [np.ones((96, 128)), np.ones((10, 10)), np.ones((96, 128)), np.ones((96, 128))])
     with pytest.raises(UserError, match="1 masks for 4 views"):
         masks_for_model(scene, [np.ones((96, 128))])
+
+
+def test_a_string_is_one_name():
+    assert chosen_formats("ply") == check_formats("ply", ["a.jpg"]) == ["ply"]

@@ -177,6 +177,11 @@ def test_the_memory_planner_and_chunks_count_the_pixels_that_are_asked_for(monke
     assert wish.plan(model, found, Compute()) is None
     with pytest.raises(UserError, match=r"at most .* photos of 128 x 96 pixels fit into memory"):
         wish.plan(model, found, Compute(), process_res=128)
+    with pytest.raises(
+        UserError, match=r"the run in the output folder predicts 12 photos together, and at most"
+    ) as said:
+        SequenceWish().plan(model, found, Compute(), process_res=128, before=12)
+    assert "--chunk" not in str(said.value)
     with pytest.raises(UserError, match=r"12 images of 128 x 96 pixels .* use at most"):
         freegeo.reconstruct(model, found, process_res=128, device="cpu")
 

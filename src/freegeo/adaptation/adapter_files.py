@@ -76,7 +76,7 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
     folder, model = find_adapter(folder), model.adaptable()
     config, tensors = read_peft(folder)
     metadata = adapter_metadata(folder)
-    _require_same_base(model, metadata, folder)
+    _require_same_base(model.spec.name, _base(model)["fingerprint"], metadata, folder)
     tensors = own_names(model, tensors) | _camera_token(model, folder)
     adapter = Adapter.attach(
         model,
@@ -103,6 +103,15 @@ def load_adapter(model: ReconstructionModel, folder: str | Path) -> Adapter:
         adapter.detach()
         raise
     return adapter
+
+
+def require_fitting(model: ReconstructionModel, folder: Path, fingerprint: str) -> None:
+    """Raise UserError where `load_adapter` would, for a model with weights of this fingerprint.
+
+    The model itself needs no weights (`build_empty`), so that commands can check before they remove or load anything.
+    """
+    _require_same_base(model.spec.name, fingerprint, adapter_metadata(folder), folder)
+    load_adapter(model, folder).detach()
 
 
 def find_adapter(path: str | Path) -> Path:
@@ -176,16 +185,16 @@ def _base(model: ReconstructionModel) -> dict[str, Any]:
     return {"model": model.spec.name, **weights, "licence": model.spec.weights_licence}
 
 
-def _require_same_base(model: ReconstructionModel, metadata: Mapping[str, Any] | None, folder: Path) -> None:
+def _require_same_base(model: str, fingerprint: str, metadata: Mapping[str, Any] | None, folder: Path) -> None:
     if metadata is None:
         return
-    base, mine = metadata["base"], _base(model)
-    if base["model"] != mine["model"]:
-        raise UserError(f"{folder}: the adapter was made for {base['model']}, not for {mine['model']}. Use that model.")
-    if base["fingerprint"] and mine["fingerprint"] and base["fingerprint"] != mine["fingerprint"]:
+    base = metadata["base"]
+    if base["model"] != model:
+        raise UserError(f"{folder}: the adapter was made for {base['model']}, not for {model}. Use that model.")
+    if base["fingerprint"] and fingerprint and base["fingerprint"] != fingerprint:
         raise UserError(
             f"{folder}: the adapter was made for another checkpoint of {base['model']} ({base['fingerprint']}, this is "
-            f"{mine['fingerprint']}). Use that checkpoint."
+            f"{fingerprint}). Use that checkpoint."
         )
 
 

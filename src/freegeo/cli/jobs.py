@@ -73,6 +73,7 @@ def run_job(
     filters, masks and formats are written from the predictions that it holds. `after` writes more before the folder
     counts as finished.
     """
+    from freegeo.adaptation.adapter_files import require_fitting
     from freegeo.models.images import chosen_side
     from freegeo.pipeline import require_enough_photos
     from freegeo.posed import undistorted_masks
@@ -105,6 +106,9 @@ def run_job(
         found, empty.spec, plan, command=command, model=model_options.identity(plan), trusted=cameras.trust_cameras,
         filters=files.filter_settings(found.masks), extra=extra_settings, **same,
     )  # fmt: skip
+    if adapter is not None:
+        # Before a result that is there gives way.
+        require_fitting(empty, adapter, model_options.fingerprint)
     with progress_hooks() as hooks:
         summary, finished_at = run_in_folder(
             output.output, settings, found, overwrite=output.overwrite, trusted=cameras.trust_cameras,
