@@ -239,6 +239,8 @@ def test_recipes_by_name_and_by_hand(model):
     for recipe, words in (("best", "unknown recipe 'best'"), (3, "not int"), ("paper", "choose --dataset")):
         with pytest.raises(UserError, match=words):
             freegeo.adapt(model, pictures(), guard="off", recipe=recipe)
+    with pytest.raises(UserError, match="guard is select, report, off, not 'foo'"):
+        freegeo.adapt(model, pictures(), guard="foo", recipe=quick(model))
     with pytest.raises(UserError, match="given by name"):
         freegeo.adapt(model, pictures(), guard="off", recipe=quick(model), dataset="eth3d")
 
