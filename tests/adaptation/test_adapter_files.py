@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from freegeo.adaptation.adapter import Adapter
+from freegeo.adaptation.adapter import Adapter, is_adapted
 from freegeo.adaptation.adapter_files import (
     adapter_metadata,
     export_published,
@@ -20,6 +20,7 @@ from freegeo.adaptation.adapter_files import (
     own_names,
     read_camera_token,
     read_peft,
+    require_fitting,
     save_adapter,
 )
 from freegeo.errors import FreeGeoError, UserError
@@ -215,6 +216,20 @@ def test_an_adapter_of_another_checkpoint_is_refused(tmp_path):
     other = tiny_da3(seed=5)
     other.loaded_from = LoadedFrom(model="tiny-da3", file="b.safetensors", fingerprint="bbbb", licence="none")
     refused(other, tmp_path, r"another checkpoint of tiny-da3 \(aaaa, this is bbbb\)")
+
+
+def test_whether_an_adapter_fits_is_known_without_the_weights(tmp_path):
+    model = tiny_da3()
+    model.loaded_from = LoadedFrom(model="tiny-da3", file="a.safetensors", fingerprint="aaaa", licence="none")
+    save_adapter(attach(model), tmp_path, METADATA)
+    empty = tiny_da3().to("meta")
+    require_fitting(empty, tmp_path, "aaaa")
+    assert not is_adapted(empty)
+    with pytest.raises(UserError, match="another checkpoint of tiny-da3"):
+        require_fitting(empty, tmp_path, "bbbb")
+    (tmp_path / "freegeo.json").unlink()
+    with pytest.raises(UserError, match="no linear layers of tiny-vggt"):
+        require_fitting(tiny_vggt().to("meta"), tmp_path, "aaaa")
 
 
 @pytest.mark.parametrize("missing", ["adapter_config.json", "adapter_model.safetensors"])
