@@ -373,6 +373,7 @@ def test_the_state_that_the_guard_chose_is_the_adapter(model, tmp_path, judged, 
     assert np.allclose(freegeo.reconstruct(model, pictures(), adapter=tmp_path).depth_z, used, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outcome", ["frozen", "unknown"])
 def test_an_adapter_that_the_guard_refuses_has_no_strength(model, judged, outcome):
     before = freegeo.reconstruct(model, pictures())
@@ -384,6 +385,7 @@ def test_an_adapter_that_the_guard_refuses_has_no_strength(model, judged, outcom
     assert not close(freegeo.reconstruct(model, pictures()), before)
 
 
+@pytest.mark.slow
 def test_a_guard_that_reports_changes_nothing(model, judged):
     result = freegeo.adapt(model, pictures(), steps=4, sets=2, lr=1e-2, guard="report")
     reported = tensors(result)

@@ -91,6 +91,7 @@ def test_a_run_prints_and_stores_its_tables_and_a_second_one_does_nothing_again(
     assert freegeo("evaluate", "features", *options[:4])[0] in (0, 1)
 
 
+@pytest.mark.slow
 def test_a_run_whose_folder_is_deleted_ends_at_once(freegeo, options, tmp_path, monkeypatch):
     plain, calls = predicting.write_stored, []
 

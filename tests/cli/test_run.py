@@ -144,6 +144,7 @@ def test_other_photos_of_the_same_names_are_other_options(freegeo, finished, pho
     assert "photos with other contents" in outcome.sentence()
 
 
+@pytest.mark.slow
 def test_overwrite_replaces_the_result_and_spares_the_users_files(freegeo, photo_folder, tiny, tmp_path):
     out = tmp_path / "out"
     assert freegeo("run", photo_folder, "-o", out, *tiny, *QUICK).code == 0
@@ -270,6 +271,7 @@ def test_an_adapter_that_changes_nothing_gives_the_frozen_result(freegeo, photo_
     assert not np.allclose(prediction(tmp_path / "a")["T_cam_world"], frozen["T_cam_world"], rtol=1e-2, atol=1e-2)
 
 
+@pytest.mark.slow
 def test_numbers_that_are_not_finite_after_adaptation_leave_the_frozen_result(
     freegeo, finished, photo_folder, tiny, tmp_path, monkeypatch
 ):
@@ -415,6 +417,7 @@ def test_interrupted_run_continues_to_the_same_result(
     assert files(out) == files(finished)
 
 
+@pytest.mark.slow
 def test_what_a_killed_process_leaves_continues_to_the_same_result(
     freegeo, finished, photo_folder, tiny, tmp_path, monkeypatch
 ):

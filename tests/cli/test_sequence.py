@@ -121,6 +121,7 @@ def test_chunks_become_one_result(freegeo, walk, tiny, tmp_path, oracle, truth):
     assert len(list((tmp_path / "out/colmap").rglob("*.png"))) == FRAMES
 
 
+@pytest.mark.slow
 def test_one_chunk_is_the_same_as_none_to_the_bit(freegeo, walk, tiny, tmp_path):
     for name, more in (("none", []), ("one", ["--chunk", FRAMES, "--overlap", 3])):
         assert freegeo("reconstruct", walk, "-o", tmp_path / name, *tiny, *more).code == 0
