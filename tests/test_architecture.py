@@ -18,8 +18,12 @@ ALLOWED = {
         *("job", "pipeline", "guarded", "posed", "metres", "cameras"),
     },
     "runs": {
-        *("models", "data", "adaptation", "evidence", "export", "fusion", "sequence", "progress"),
+        *("models", "data", "adaptation", "export", "sequence"),
         *("job", "sequence_job", "pipeline", "posed", "metres", "cameras"),
+    },
+    "sequence_api": {
+        *("models", "data", "adaptation", "evidence", "export", "fusion", "sequence", "progress"),
+        *("runs", "job", "pipeline", "posed", "cameras"),
     },
     "pipeline": {
         *("models", "data", "adaptation", "evidence", "export", "progress"),

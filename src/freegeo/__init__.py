@@ -16,7 +16,7 @@ _HOMES = {
     "read_cameras": "freegeo.cameras.reading",
     "adapt": "freegeo.pipeline",
     "reconstruct": "freegeo.pipeline",
-    "reconstruct_sequence": "freegeo.runs",
+    "reconstruct_sequence": "freegeo.sequence_api",
     "refine": "freegeo.refined",
     "load_adapter": "freegeo.pipeline",
     "open_reconstruction": "freegeo.export.reconstruction",

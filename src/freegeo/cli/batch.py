@@ -121,6 +121,7 @@ def batch(
     """
     from freegeo.adaptation.adapter_files import find_adapter
     from freegeo.models.images import chosen_side
+    from freegeo.runs import adapter_identity
 
     if jobs is not None and (jobs < 1 or cluster):
         raise UserError(
@@ -148,8 +149,6 @@ def batch(
     planned(empty, recipe if adapting else None, refine=refine, pose_from=pose_from, placing=placing)
     found = _look_at_all(named, photos, files, adapting=adapting, has_cameras=empty.spec.cameras)
     model.warn_of_embedded([source for scene in named for source in scene.sources])
-    from freegeo.runs import adapter_identity
-
     common = [model.fingerprint, None if adapter is None else adapter_identity(adapter)]
     options = [*as_arguments(model), *as_arguments(placing), *as_arguments(sequence), *as_arguments(files)]
     options += [f"--refine={refine}", f"--pose-from={pose_from}"]
