@@ -89,7 +89,12 @@ def prepare(page, files, *, adapt=True, steps: int | str = 2):
     page.set_input_files("#photos input[type=file]", [str(file) for file in files])
     page.wait_for_selector(".fg-uploads")
     page.get_by_text("Advanced", exact=True).click()
-    page.get_by_label("Training steps").fill(str(steps))
+    page.locator("#skip-bad").wait_for()  # the last of the controls that Gradio makes when they are first shown
+    field = page.get_by_label("Training steps")
+    field.clear()
+    field.press_sequentially(str(steps))
+    field.press("Tab")
+    assert field.input_value() == str(steps)
     page.locator("#refine").get_by_label("off").check()
     if not adapt:
         page.locator("#adapt input").uncheck()
