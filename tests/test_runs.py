@@ -13,6 +13,7 @@ from PIL import Image
 
 import freegeo
 from freegeo import runs
+from freegeo.adaptation import memory
 from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapter import is_adapted
 from freegeo.adaptation.adapter_files import load_adapter, save_adapter
@@ -102,9 +103,9 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 
 @pytest.mark.parametrize(
-    "read", ["own adapter", "own photos", "adapter of another model", "adapter of nobody knows what"]
+    "read", ["own adapter", "own photos", "adapter of another model", "adapter of nobody knows what", "too much memory"]
 )
-def test_nothing_is_removed_for_a_run_that_is_refused(tmp_path, read):
+def test_nothing_is_removed_for_a_run_that_is_refused(monkeypatch, tmp_path, read):
     out, model = tmp_path / "out", tiny_da3()
     with run_folder(out, {"command": "reconstruct"}) as run:
         write_json(run / "reconstruction.json", {})
@@ -117,10 +118,15 @@ def test_nothing_is_removed_for_a_run_that_is_refused(tmp_path, read):
     if read.endswith("what"):
         (other / "freegeo.json").unlink()
     photos = out / "images" if read == "own photos" else pictures()
-    adapter = {"own adapter": out, "own photos": None}.get(read, other)
+    adapter = {"own adapter": out, "own photos": None, "too much memory": None}.get(read, other)
+    wish: dict = {} if read != "too much memory" else {"recipe": "scene"}
+    if wish:
+        free = iter((10**9, 10**5))  # to predict, and to adapt
+        monkeypatch.setattr(memory, "available", lambda device, model: next(free))
     before = contents(out)
-    with pytest.raises(UserError, match=r"--overwrite would remove it|made for tiny-vggt|belongs to another model"):
-        freegeo.reconstruct_sequence(model, photos, out, adapter=adapter, overwrite=True)
+    refused = r"--overwrite would remove it|made for tiny-vggt|belongs to another model|adapting tiny-da3 needs"
+    with pytest.raises(UserError, match=refused):
+        freegeo.reconstruct_sequence(model, photos, out, adapter=adapter, overwrite=True, **wish)
     assert contents(out) == before and not is_adapted(model)
     load_adapter(model, out)
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from freegeo.adaptation.adapt import require_unchanged_images
 from freegeo.adaptation.adapter_files import WEIGHTS, read_peft
-from freegeo.adaptation.memory import plan_reconstruction
+from freegeo.adaptation.memory import plan_reconstruction, require_adaptation_fits
 from freegeo.adaptation.recipe import SMALLEST_SCENE, Guard, Recipe
 from freegeo.cameras.undistortion import UndistortedPhoto
 from freegeo.data.photos import doubt_blank, some_of
@@ -209,6 +209,10 @@ def read_inputs(
     require_reference(reference, priors)
     if recipe is not None and priors is not None:
         require_unchanged_images(recipe)
+    if recipe is not None and before is None:
+        # Before a result that is there gives way. An adapter that is trained already needs no memory.
+        together = len(batch) if chunks is None else min(chunks.size, len(batch))
+        require_adaptation_fits(model, together, batch.image_hw, recipe, compute=compute)
     source = None if scale is None else read_scale(scale, photos)
     if source is not None:
         require_in_view(source, batch, photos)

@@ -22,9 +22,9 @@ from torch import nn
 
 from freegeo.adaptation.adapter import count_trainable
 from freegeo.adaptation.losses.numerics import CPU_BLOCK_ELEMENTS, DEVICE_BLOCK_ELEMENTS
-from freegeo.adaptation.recipe import Recipe
+from freegeo.adaptation.recipe import SEED, Recipe
 from freegeo.adaptation.samples import Place, SceneImages, distinct, sample_key, view_keys
-from freegeo.adaptation.views import ViewSet, Visit
+from freegeo.adaptation.views import ViewSet, Visit, schedule
 from freegeo.errors import UserError
 from freegeo.host import gigabytes, host_available
 from freegeo.models.api import ReconstructionModel, views_per_chunk
@@ -97,7 +97,26 @@ def plan_adaptation(
             logger.info("%s; %s are free", plan.summary(), gigabytes(budget))
             logger.debug("at the peak: %s", ", ".join(f"{name} {gigabytes(size)}" for name, size in plan.parts))
             return plan
-    raise UserError(
+    raise _too_large(plan, model, budget)
+
+
+def require_adaptation_fits(
+    model: ReconstructionModel, views: int, image_hw: ImageSize, recipe: Recipe, *, compute: Compute
+) -> None:
+    """Raise UserError where adapting to `views` images of one scene does not fit into the memory that is free now.
+
+    For the time before a run, when an earlier result is still there; `plan_adaptation` looks again, at the disk too.
+    The model may be on the meta device.
+    """
+    budget = available(compute.device, model)
+    job = Footprint.of_scene(model, views, image_hw, recipe, compute.preferring(recipe.precision))
+    plan = job.plan("disk", checkpointing=True)
+    if plan.peak_bytes > budget:
+        raise _too_large(plan, model, budget)
+
+
+def _too_large(plan: Plan, model: ReconstructionModel, budget: int) -> UserError:
+    return UserError(
         f"adapting {model.spec.name} needs {gigabytes(plan.peak_bytes)} even with activation checkpointing (and "
         f"{gigabytes(plan.kept_bytes)} of disk), and {gigabytes(budget)} are free. Use smaller images "
         "(--process-res), fewer --views, --precision bf16 or a smaller model."
@@ -124,6 +143,14 @@ class Footprint:
         self.visits = [visit.view_set for visits in steps for visit in visits]
         # The largest view set decides; sets differ in the number of views and in the size of their images.
         self.largest = max(self.visits, key=lambda view_set: len(view_set.frames) * self.tokens[view_set.scene])
+
+    @classmethod
+    def of_scene(
+        cls, model: ReconstructionModel, views: int, image_hw: ImageSize, recipe: Recipe, compute: Compute
+    ) -> Footprint:
+        """Return those of a run that adapts to one scene of `views` images."""
+        images = SceneImages(name="photos", count=views, load=lambda frames: torch.empty(len(frames), 3, *image_hw))
+        return cls(model, [images], recipe, schedule([views], recipe, SEED), compute)
 
     def plan(self, place: Place, checkpointing: bool) -> Plan:
         """Predict what is on the device at the peak: in the teacher's pass, the student's or that of all views."""

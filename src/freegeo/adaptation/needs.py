@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from freegeo.adaptation.memory import Footprint, plan_reconstruction
-from freegeo.adaptation.recipe import SEED, scene
-from freegeo.adaptation.samples import SceneImages
-from freegeo.adaptation.views import schedule
+from freegeo.adaptation.recipe import scene
 from freegeo.models import catalog
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
@@ -74,9 +72,5 @@ def _reconstruction_bytes(model: ReconstructionModel, views: int, image_hw: tupl
 
 
 def _adaptation_bytes(model: ReconstructionModel, image_hw: tuple[int, int]) -> tuple[int, int]:
-    recipe = scene(model.spec)
-    photos = SceneImages(
-        name="photos", count=ADAPTED_VIEWS, load=lambda frames: torch.empty(len(frames), 3, *image_hw)
-    )  # fmt: skip
-    job = Footprint(model, [photos], recipe, schedule([ADAPTED_VIEWS], recipe, SEED), GPU)
+    job = Footprint.of_scene(model, ADAPTED_VIEWS, image_hw, scene(model.spec), GPU)
     return job.plan("device", checkpointing=False).peak_bytes, job.plan("disk", checkpointing=True).peak_bytes
