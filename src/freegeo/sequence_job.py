@@ -13,6 +13,7 @@ from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -25,8 +26,10 @@ from freegeo.data.photos import some_of
 from freegeo.data.video import VideoFrame
 from freegeo.errors import FreeGeoError, LostFolderError, UserError
 from freegeo.evidence.candidate import Candidate
-from freegeo.evidence.matches import stored_matches
-from freegeo.export.base import KEPT_NAME
+from freegeo.evidence.matches import combined, load_matches, stored_matches
+from freegeo.evidence.refinement import Refinement, depth_factors, refine
+from freegeo.export.base import KEPT_NAME, TRACKS_NAME
+from freegeo.export.measured import save_tracks
 from freegeo.export.pixels import masks_for_model
 from freegeo.export.reconstruction import Reconstruction, Scale, save_streamed
 from freegeo.files import write_json
@@ -56,11 +59,13 @@ from freegeo.pipeline import capital, judge_by_photos
 from freegeo.posed import doubt_focal_length, told_in_chunks, with_one_camera
 from freegeo.report.page import write_report
 from freegeo.run_folder import Part
+from freegeo.sequence.alignment import Seam
 from freegeo.sequence.assembly import CONTRADICTED, Assembly, Seams, assemble, broken, seams_between
-from freegeo.sequence.chunks import Chunk, OrderRule, bridge, plan_chunks, runs
+from freegeo.sequence.chunks import Chunk, OrderRule, bridge, common_rows, plan_chunks, runs
 from freegeo.sequence.cuts import Jumps, find_cuts
 from freegeo.sequence.join import Joined, Member
 from freegeo.sequence.loops import Loop, agrees, loop_candidates, loop_frames, verified
+from freegeo.sequence.measured import measured_seam
 from freegeo.sequence.order import descriptors, in_order, new_pictures, similarity_order
 
 if TYPE_CHECKING:
@@ -87,6 +92,7 @@ LOOP_APART, FEWEST_APART = 2, 6
 """Frames of a loop are at least so many chunks, and so many frames, apart."""
 _READ_AT_ONCE = 16
 _NOT_NEEDED = "it fits to no other chunk, and these have all of its frames."
+_SPARE = "no matches prove its cameras, and the chunks beside it, of which they do, have all of its frames."
 _AT_ONE_END = "The prediction of the frames around both ends does not fit to the chunks at both of them."
 _KNOWN_MEDIANS = ("scale", "spread", "rotation_deg", "position", "focal")
 """What is said of known cameras as the median over chunks."""
@@ -145,6 +151,11 @@ class SequenceJob(Job):
     order: Literal["given", "similar"] = "given"
     count: int = 0
     """Chunks of the sequence."""
+    spare: set[int] = field(default_factory=set)
+    """Chunks that are left out because others, which are surer, have their frames."""
+    _measured: dict[tuple[str, str], Seam | None] = field(default_factory=dict)
+    matched: list[str] = field(default_factory=list)
+    """Folders of the chunks, loops and bridges that have a part in the result."""
 
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
@@ -158,6 +169,8 @@ class SequenceJob(Job):
             raise FreeGeoError(f"no chunk could be predicted: {capital(next(iter(self.failed.values())))}")
         loops, tied = self._loops() if self.plan.loops and not self._is_placed else ([], [])
         numbers = [number for number in range(len(chunks)) if number not in self.failed]
+        self.spare = self._spare(chunks, numbers)
+        numbers = [number for number in numbers if number not in self.spare]
         parts = [*(chunks[number] for number in numbers), *tied]
         names = [*map(_chunk_name, numbers), *map(_tie_name, tied)]
         with self._timed("seams between chunks", JOINING):
@@ -172,7 +185,10 @@ class SequenceJob(Job):
             )  # fmt: skip
         load = [partial(self._reader(names), k) for k in range(len(names))]
         pieces = [[Member(chunk=parts[k], sim3=found.sim3[k], load=load[k]) for k in piece] for piece in found.pieces]
-        loops = self._held(found, loops, parts, len(numbers))
+        held = self._held(found, loops, parts, len(numbers))
+        left_out = {_tie_name(one) for one, loop in zip(tied, _tying(held, loops), strict=True) if loop.reason}
+        self.matched = [*(name for name in names if name not in left_out), *map(_chunk_name, sorted(self.spare))]
+        loops = held
         told = self._told_of(chunks, numbers, found, loops)
         return self._write(list(zip(pieces, found.frames, strict=True)), told, adaptation)
 
@@ -444,9 +460,46 @@ class SequenceJob(Job):
                 logger.info("no bridge over frames %s: %s", tie, reason)
         return found
 
-    def _seams(self, parts: Sequence[Chunk], names: Sequence[str], known: Seams | None = None) -> Seams:
+    def _spare(self, chunks: Sequence[Chunk], numbers: Sequence[int]) -> set[int]:
+        """Return the chunks that matches do not prove, and whose frames are in chunks beside them that matches join."""
+        sure = [number for number in numbers if self._is_proven(_chunk_name(number))]
+        return {
+            number
+            for a, b in pairwise(sure)
+            for number in range(a + 1, b)
+            if number in numbers
+            and {*chunks[number].frames} <= {*chunks[a].frames, *chunks[b].frames}
+            and self._measured_seam(_chunk_name(a), _chunk_name(b), range(a, b + 1)) is not None
+        }
+
+    def _is_proven(self, name: str) -> bool:
+        """Whether the cameras of a chunk, loop or bridge were brought to matches that prove them."""
         refined = self.folder.notes.get("refinement") or {}
-        measured = [k for k, name in enumerate(names) if refined.get(f"{CHUNKS_FOLDER}/{name}", {}).get("accepted")]
+        return bool(refined.get(f"{CHUNKS_FOLDER}/{name}", {}).get("accepted"))
+
+    def _measured_seam(self, first: str, second: str, between: Sequence[int] = ()) -> Seam | None:
+        """Return the seam by points that matches of two chunks, and of those between them, measure in both."""
+        if (first, second) not in self._measured:
+            names = dict.fromkeys((first, second, *map(_chunk_name, between)))
+            parts = [load_matches(self.folder / CHUNKS_FOLDER / name / MATCHES_NAME) for name in names]
+            one, two = (Reconstruction.load(self.folder / CHUNKS_FOLDER / name) for name in (first, second))
+            self._measured[first, second] = (
+                None
+                if parts[0] is None or parts[1] is None
+                else measured_seam(
+                    Candidate.of(one), Candidate.of(two), (one.names, two.names), [part for part in parts if part],
+                    fixed_scale=self.spec.metric,
+                )
+            )  # fmt: skip
+        return self._measured[first, second]
+
+    def _seams(self, parts: Sequence[Chunk], names: Sequence[str], known: Seams | None = None) -> Seams:
+        sure, measured = [k for k, name in enumerate(names) if self._is_proven(name)], {}
+        for a, b in combinations(sure, 2):
+            if common_rows(parts[a], parts[b]) or (names[a], names[b]) in self._measured:
+                seam = self._measured_seam(names[a], names[b])
+                if seam is not None:
+                    measured[a, b] = seam
         return seams_between(parts, self._reader(names), fixed_scale=self.spec.metric, measured=measured, known=known)
 
     def _reader(self, names: Sequence[str]) -> Callable[[int], Reconstruction]:
@@ -474,7 +527,9 @@ class SequenceJob(Job):
                 {
                     "number": number, "first": chunk.frames[0], "last": chunk.frames[-1], "frames": len(chunk.frames),
                     "piece": piece_of.get(number),
-                    "reason": self.failed.get(number, None if number in piece_of else _NOT_NEEDED),
+                    "reason": self.failed.get(
+                        number, None if number in piece_of else _SPARE if number in self.spare else _NOT_NEEDED
+                    ),
                     "refined": refined.get(f"{CHUNKS_FOLDER}/{_chunk_name(number)}", {}).get("accepted"),
                 }
                 for number, chunk in enumerate(chunks)
@@ -508,14 +563,6 @@ class SequenceJob(Job):
                 f"The photos fall into {len(parts)} pieces that could not be joined: the result is that of "
                 f"{self._span(parts[0])}, and there are {others}."
             )
-        doubtful = [seam for seam in told["seams"] if seam["used"] and seam["reason"] and seam["kind"] == "neighbours"]
-        if doubtful:
-            worst = max(doubtful, key=lambda seam: seam["gap"] or 0.0)
-            self._warn(
-                f"Neighbouring chunks fit badly at {len(doubtful)} seams, worst of all chunks {worst['first']} and "
-                f"{worst['second']}: {worst['reason']} Surfaces may be bent or doubled there. Try another --chunk, a "
-                "larger --overlap or a larger model."
-            )
         if missing:
             self._warn(f"{missing} of {len(self.batch)} photos are in no chunk that could be predicted.")
         summary: dict[str, Any] = {}
@@ -524,6 +571,22 @@ class SequenceJob(Job):
         self.after(self)
         self.folder.finish()
         return summary
+
+    def _doubt_seams(self, number: int, told: Mapping[str, Any]) -> None:
+        """Warn of seams in a piece at which surfaces may be bent."""
+        piece_of = {chunk["number"]: chunk["piece"] for chunk in told["chunks"]}
+        doubtful = [
+            seam
+            for seam in told["seams"]
+            if seam["used"] and seam["reason"] and seam["kind"] == "neighbours" and piece_of[seam["first"]] == number
+        ]
+        if doubtful:
+            worst = max(doubtful, key=lambda seam: seam["gap"] or 0.0)
+            self._warn(
+                f"Neighbouring chunks fit badly at {len(doubtful)} seams, worst of all chunks {worst['first']} and "
+                f"{worst['second']}: {worst['reason']} Surfaces may be bent or doubled there. Try another --chunk, a "
+                "larger --overlap or a larger model."
+            )
 
     def _span(self, part: Mapping[str, int]) -> str:
         """Return the frames and photos at the ends of a piece, for people."""
@@ -539,7 +602,10 @@ class SequenceJob(Job):
         folder, photos = self.folder.path / _piece_folder(number), [self.photos[i] for i in frames]
         label = "" if number == 0 else f"piece {number + 1}: "
         self.hooks.stage(f"{label}joining {len(members)} chunks")
-        result, about = self._joined(folder, members, frames, photos)
+        result, about = self._joined(folder, members, frames, photos, label)
+        told["pieces"][number]["together"] = about.pop("together")
+        if not (told["pieces"][number]["together"] or {}).get("accepted"):
+            self._doubt_seams(number, told)
         if result.has_cameras:
             doubt_focal_length(result, photos)
         with self._timed(f"{label}{FILES_STAGE}", FILTERS):
@@ -557,32 +623,67 @@ class SequenceJob(Job):
         return summary
 
     def _joined(
-        self, folder: Path, members: Sequence[Member], frames: Sequence[int], photos: Sequence[PhotoLike]
+        self,
+        folder: Path,
+        members: Sequence[Member],
+        frames: Sequence[int],
+        photos: Sequence[PhotoLike],
+        label: str,
     ) -> tuple[Reconstruction, dict[str, Any]]:
-        """Write the prediction of a piece, one frame after the other, and return it as it is on disk."""
+        """Write the prediction of a piece, one frame after the other, and return it as it is on disk, with facts."""
         joined = Joined(members, frames)
         batch, scale = self.batch.select(frames), _common_scale(members)
         T_cam_world, K = joined.T_cam_world, joined.K
-        about: dict[str, Any] = {"known_cameras": self._about_known(), "one_camera": None}
+        about: dict[str, Any] = {"known_cameras": self._about_known(), "one_camera": None, "together": None}
+        factors = np.ones(len(frames))
 
-        def save(factor: float = 1.0) -> Reconstruction:
+        def save() -> Reconstruction:
             save_streamed(
                 folder, names=batch.names, photo_hw=batch.photo_hw.numpy(), scale_xy=batch.scale_xy.numpy(),
                 offset_xy=batch.offset_xy.numpy(), T_cam_world=T_cam_world, K=K, scale=scale,
-                blocks=lambda name: joined.blocks(name, factor),
+                blocks=lambda name: joined.blocks(name, factors),
             )  # fmt: skip
             return Reconstruction.load(folder)
 
         if self.one_camera:
             known = None if self.known is None else self.known.select(list(frames))
             K, about["one_camera"] = _shared_K(K, batch, photos, known)
-        result = save()
+        result, tracks = save(), None
+        if self.refine:
+            with self._timed(f"{label}all photos together", JOINING):
+                found = self._refined_together(result)
+            about["together"] = _together(found)
+            logger.info("all photos together: %s", found.reason)
+            if found.accepted:
+                assert found.T_cam_world is not None and found.K is not None
+                (factors, own), tracks = depth_factors(result, found), found.tracks
+                T_cam_world, K = found.T_cam_world, found.K
+                result = save()
+                self._doubt_followers([result.names[view] for view in np.flatnonzero(~own)])
+            about["refinement"] = self._refinement(found)
         metres = self._metres(folder, result, frames, photos)
         if metres is not None:
-            T_cam_world, scale = T_cam_world.copy(), metres
+            T_cam_world, scale, factors = T_cam_world.copy(), metres, factors * metres.value
             T_cam_world[:, :3, 3] *= metres.value
-            result = save(metres.value)
+            tracks = None if tracks is None else replace(tracks, xyz=tracks.xyz * metres.value)
+            result = save()
+        if tracks is not None:
+            save_tracks(folder, tracks)
+        else:
+            files.remove_written(folder / TRACKS_NAME)
         return result, about
+
+    def _refined_together(self, result: Reconstruction) -> Refinement:
+        """Bring the cameras of a piece to the matches of all chunks by one bundle adjustment, or say why not."""
+        found = [load_matches(self.folder / CHUNKS_FOLDER / name / MATCHES_NAME) for name in self.matched]
+        parts = [matches for matches in found if matches is not None]
+        if len(parts) < len(found):
+            return Refinement(accepted=False, reason=f"{len(found) - len(parts)} chunks have no matches.")
+        return refine(result, combined(parts, result.names))
+
+    def _doubt_followers(self, names: Sequence[str]) -> None:
+        if names:
+            self._warn(f"Too few matches for {some_of(names)}: they follow their neighbours and keep the median scale.")
 
     def _metres(
         self, folder: Path, result: Reconstruction, frames: Sequence[int], photos: Sequence[PhotoLike]
@@ -620,21 +721,28 @@ class SequenceJob(Job):
             "measured": {**(_medians(measured) or {}), **sums} if measured else None,
         }  # fmt: skip
 
-    def _refinement(self) -> dict[str, Any] | None:
-        """Return what refinement made of the chunks; scores are medians over those where it was accepted."""
+    def _refinement(self, whole: Refinement | None = None) -> dict[str, Any] | None:
+        """Return what refinement made of the chunks, and of all photos of a piece together.
+
+        Scores are medians over the chunks where it was accepted.
+        """
         noted = self.folder.notes.get("refinement") or {}
         own = {f"{CHUNKS_FOLDER}/{_chunk_name(number)}" for number in range(self.count)}
         told = [value for name, value in noted.items() if name in own and "accepted" in value]
         if not told:
             return None
         accepted = [one for one in told if one["accepted"]]
+        is_whole = whole is not None and whole.accepted
         refused = Counter(one["reason"] for one in told if not one["accepted"])
         reason = f"The cameras of {len(accepted)} of {len(told)} chunks were brought to matches that prove them."
         if refused:
             reason += f" Of the others, most often: {refused.most_common(1)[0][0]}"
+        if whole is not None:
+            stay = "" if is_whole else " They stay as their chunks were placed."
+            reason += f" All photos together: {whole.reason}{stay}"
         return {
-            "accepted": bool(accepted), "reason": reason, "told": any(one["told"] for one in told),
-            "lacking": None if accepted else Counter(one["lacking"] for one in told).most_common(1)[0][0],
+            "accepted": bool(accepted) or is_whole, "reason": reason, "told": any(one["told"] for one in told),
+            "lacking": None if accepted or is_whole else Counter(one["lacking"] for one in told).most_common(1)[0][0],
             "probability": _median(one["probability"] for one in accepted), "misfit": None,
             "pairs": sum(one["pairs"] for one in accepted),
             **{name: _medians([one[name] for one in accepted]) for name in ("frozen", "before", "after")},
@@ -685,6 +793,21 @@ def _tie_name(chunk: Chunk) -> str:
 def _piece_folder(number: int) -> str:
     """Where a piece is, below the output folder; the first one is the result itself."""
     return "." if number == 0 else f"{PIECES_FOLDER}/{number + 1}"
+
+
+def _tying(held: Sequence[Loop], before: Sequence[Loop]) -> list[Loop]:
+    """Return those of the loops found that had a chunk of their own."""
+    return [loop for loop, known in zip(held, before, strict=True) if known.reason is None]
+
+
+def _together(found: Refinement) -> dict[str, Any]:
+    """Return what reconstruction.json says of the bundle adjustment of all photos of a piece."""
+    errors = {"before_px": found.before_px, "after_px": found.after_px}
+    return {
+        "accepted": found.accepted, "reason": found.reason, "probability": found.probability,
+        "pairs": 0 if found.pairs is None else len(found.pairs),
+        **{name: None if values is None else float(np.median(values)) for name, values in errors.items()},
+    }  # fmt: skip
 
 
 def _common_scale(members: Sequence[Member]) -> Scale | None:

@@ -12,16 +12,20 @@ import pytest
 import torch
 from PIL import Image
 
+from evidence_tools import turned
 from freegeo import job, load_model, reconstruct_sequence, sequence_job
 from freegeo.adaptation.adapter import is_adapted
 from freegeo.cameras.known import KnownCamera, KnownCameras
 from freegeo.cameras.plain import write
 from freegeo.data.procedural import render, sample_rooms
+from freegeo.data.procedural import walk as generated_walk
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.export.measured import load_tracks
 from freegeo.export.pixels import corner_K
 from freegeo.export.reconstruction import Reconstruction, open_reconstruction
 from freegeo.fusion.tracks import Tracks
 from freegeo.geometry.sim3 import Sim3, align_cameras
+from freegeo.metrics.pose import pair_errors
 from freegeo.refined import Refined
 from freegeo.sequence.chunks import Chunk
 from freegeo.sequence.cuts import Jumps
@@ -67,12 +71,18 @@ class Oracle:
 @pytest.fixture(scope="session")
 def truth() -> Reconstruction:
     views = render(sample_rooms([20_000_003], domain="test-id", frames=FRAMES), 48, 64)
+    images = (views.images[0].permute(0, 2, 3, 1) * 255).round().byte().numpy()
+    return reconstruction_of(views.depth_z[0].numpy(), images, views.T_cam_world[0].numpy(), views.K[0].numpy())
+
+
+def reconstruction_of(
+    depth_z: np.ndarray, images: np.ndarray, T_cam_world: np.ndarray, K: np.ndarray
+) -> Reconstruction:
     return Reconstruction(
-        depth_z=views.depth_z[0].numpy(), conf=np.ones((FRAMES, 48, 64), np.float32),
-        images=(views.images[0].permute(0, 2, 3, 1) * 255).round().byte().numpy(),
-        names=tuple(f"{k:02d}.png" for k in range(FRAMES)), photo_hw=np.tile([48, 64], (FRAMES, 1)),
+        depth_z=depth_z, conf=np.ones_like(depth_z), images=images,
+        names=tuple(f"{k:02d}.png" for k in range(FRAMES)), photo_hw=np.tile(depth_z.shape[1:], (FRAMES, 1)),
         scale_xy=np.ones((FRAMES, 2)), offset_xy=np.zeros((FRAMES, 2)),
-        T_cam_world=views.T_cam_world[0].numpy(), K=views.K[0].numpy(),
+        T_cam_world=T_cam_world, K=K,
     )  # fmt: skip
 
 
@@ -117,7 +127,10 @@ def test_chunks_become_one_result(freegeo, walk, tiny, tmp_path, oracle, truth):
     assert seams == [(0, 1, "neighbours", 3), (1, 2, "neighbours", 3), (2, 3, "neighbours", 3)]
     assert all(seam["used"] and seam["inliers"] > 0.99 and seam["gap"] < 1e-3 for seam in about["seams"])
     (piece,) = about["pieces"]
-    assert piece == {"folder": ".", "first": 0, "last": FRAMES - 1, "frames": FRAMES, "ranges": [[0, FRAMES - 1]]}
+    ranges = [[0, FRAMES - 1]]
+    assert piece == {
+        "folder": ".", "first": 0, "last": FRAMES - 1, "frames": FRAMES, "ranges": ranges, "together": None,
+    }  # fmt: skip
     assert len(list((tmp_path / "out/colmap").rglob("*.png"))) == FRAMES
 
 
@@ -453,6 +466,44 @@ def test_descriptors_belong_to_the_order_also_after_a_stop(freegeo, walk, tiny, 
     np.testing.assert_array_equal(seen[0], seen[1])
     with np.load(tmp_path / "out/chunks/descriptors.npz") as content:
         np.testing.assert_array_equal(content["descriptors"][order], seen[1])
+
+
+@pytest.mark.slow
+def test_all_photos_are_refined_together(freegeo, tiny, tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap", reason="needs the extra colmap")
+    scene = generated_walk(20_000_100, "tex", 240).scene(range(FRAMES))
+    depth_z, images = scene.depth_z.numpy(), np.stack([photo.read() for photo in scene.photos])
+    truth = reconstruction_of(depth_z, images, scene.T_cam_world.numpy(), scene.K.numpy())
+    for name, image in zip(truth.names, truth.images, strict=True):
+        Image.fromarray(image).save(tmp_path / name)
+
+    def bent(number: int, answer: Reconstruction) -> Reconstruction:
+        T = turned(torch.from_numpy(answer.cameras()[0]).double(), 90.0 if number == 1 else 3.0, seed=number)
+        return replace(answer, T_cam_world=T.float().numpy())
+
+    monkeypatch.setattr(job, "predict", Oracle(truth, change=bent))
+    out = tmp_path / "out"
+    options = ("--process-res", "256", "--refine", "ba", "--no-loops", "--formats", "colmap")
+    outcome = freegeo("reconstruct", tmp_path, "-o", out, *tiny, *CHUNKS, *options)
+    assert outcome.code == 0, outcome.err
+    (piece,) = told(out)["sequence"]["pieces"]
+    assert piece["together"]["accepted"] and piece["together"]["after_px"] < 0.5
+    assert "All photos together: Matches that had no part in it fit better" in told(out)["refinement"]["reason"]
+    result = open_reconstruction(out)
+    errors = pair_errors(*(torch.from_numpy(one.cameras()[0]).double() for one in (result, truth)))
+    assert errors.worst_deg.median() < 0.5
+    # The chunk that no matches prove is left out; its matches join those beside it, which share no frame.
+    lost = told(out)["sequence"]["chunks"][1]
+    assert lost["piece"] is None and lost["reason"].startswith("no matches prove its cameras")
+    seams = {(seam["first"], seam["second"]): seam["frames"] for seam in told(out)["sequence"]["seams"]}
+    assert seams == {(0, 2): 0, (2, 3): OVERLAP}
+    tracks = load_tracks(out, FRAMES)
+    assert tracks is not None and set(tracks.view.tolist()) == set(range(FRAMES))
+    first, last = (np.full(len(tracks), start) for start in (FRAMES, -1))
+    np.minimum.at(first, tracks.point, tracks.view)
+    np.maximum.at(last, tracks.point, tracks.view)
+    assert (last - first).max() >= CHUNK, "points are followed from chunk to chunk"
+    assert "measured" in (out / "colmap/README.txt").read_text()
 
 
 @pytest.mark.slow

@@ -260,6 +260,30 @@ def test_a_damaged_file_is_made_again(tmp_path, damage, caplog):
     assert load_matches(file) is not None
 
 
+def test_matches_of_overlapping_parts_are_those_of_the_whole():
+    whole, photos = found(), room().photos
+    parts = [find_matches([photos[view] for view in views]) for views in ([0, 1, 2, 3], [4, 3, 2])]
+    names = [photos[view].name for view in (4, 0, 2, 3)]
+    both = module.combined(parts, names)
+    wanted = [{0, 1, 2, 3}, {2, 3, 4}]
+    expected = {
+        frozenset(pair): whole.of_pair(number)
+        for number, pair in enumerate(whole.pairs.tolist())
+        if 1 not in pair and any(set(pair) <= views for views in wanted)
+    }
+    views = [(4, 0, 2, 3)[view] for view in range(4)]
+    assert {frozenset((views[a], views[b])) for a, b in both.pairs.tolist()} == set(expected)
+    for number, (a, b) in enumerate(both.pairs.tolist()):
+        ends = both.of_pair(number) if views[a] < views[b] else both.of_pair(number)[::-1]
+        rows = [np.unique(np.hstack(pair), axis=0) for pair in (ends, expected[frozenset((views[a], views[b]))])]
+        np.testing.assert_array_equal(*rows)
+    assert (
+        len(np.unique(both.keypoints[both.view_start[2] : both.view_start[3]], axis=0)) == np.diff(both.view_start)[2]
+    )
+    np.testing.assert_array_equal(both.photo_hw, whole.photo_hw[views])
+    assert both.reason() is None and len(both.tried) >= len(both.pairs)
+
+
 def test_up_to_sixteen_photos_are_compared_in_all_pairs():
     assert len(choose_pairs(16)) == 16 * 15 // 2
     assert choose_pairs(1).shape == choose_pairs(0).shape == (0, 2)

@@ -77,6 +77,17 @@ def test_a_missing_chunk_and_a_bridge_are_told(tmp_path):
     assert "1 of 6 seams between neighbours could not be used; 1 of them is bridged by others." in told.sentences
 
 
+def test_a_chunk_whose_frames_surer_ones_have_is_no_problem(tmp_path):
+    found = load_result(write_sequence(tmp_path, frames=FRAMES)[0])
+    record = found.summary["sequence"]
+    record["chunks"][2] |= {"piece": None, "reason": "no matches prove its cameras."}
+    record["pieces"][0]["together"] = {"accepted": True}
+    told = sequence.told(found)
+    assert told.problems == []
+    assert "1 chunk left out: surer ones have these frames." in told.sentences
+    assert "All photos refined together." in told.sentences
+
+
 def test_seams_of_loops_and_chunks_without_a_seam_are_told(pieces):
     found = pieces[0]
     content = found.summary["sequence"]

@@ -11,7 +11,7 @@ from exact_rooms import room
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.geometry.camera import project
 from freegeo.geometry.sim3 import Sim3, umeyama
-from freegeo.sequence.alignment import DOUBTFUL_INLIERS, FEWEST_INLIERS, FEWEST_PIXELS, align, gap
+from freegeo.sequence.alignment import DOUBTFUL_INLIERS, FEWEST_INLIERS, FEWEST_PIXELS, align, align_points, gap
 
 ROWS = [(2, 0), (3, 1)]
 MOVE = Sim3.exp(torch.tensor([0.4, -1.1, 0.3, 2.0, -1.0, 0.5, 0.9], dtype=torch.float64))
@@ -242,22 +242,38 @@ def test_a_seam_that_fits_badly_is_used_and_doubted():
     assert align(first, second, ROWS).doubt is None
 
 
-def test_measured_cameras_make_the_seam_where_those_of_both_chunks_agree():
+def test_points_that_matches_measure_make_the_seam_whatever_depth_says():
     first, second = chunk([0, 1, 2, 3]), chunk([1, 2, 3, 4], MOVE)
     rows = [(1, 0), (2, 1), (3, 2)]
     bent = replace(second, depth_z=second.depth_z * np.float32(1.4))
-    by_points, by_cameras = align(first, bent, rows), align(first, bent, rows, measured=True)
-    assert not by_points.by_cameras
-    assert by_cameras.by_cameras
-    difference = (by_cameras.sim3 @ MOVE).log()
-    assert float(difference.abs().max()) < 1e-3
-    assert float((by_points.sim3 @ MOVE).log().abs().max()) > 0.1
-    assert by_cameras.doubt is not None
-    assert by_cameras.weight == 1
-    turned = bent.cameras()[0].copy()
-    turned[:, :3] = Sim3.exp(torch.tensor([0.6, 0, 0, 0, 0, 0, 0]).double()).R.numpy() @ turned[:, :3]
-    turned[1] = bent.cameras()[0][1]
-    assert not align(first, replace(bent, T_cam_world=turned), rows, measured=True).by_cameras
+    by_depth, by_points = align(first, bent, rows), align(first, bent, rows, measured=MOVE.inverse())
+    assert not by_depth.by_matches
+    assert by_points.by_matches and by_points.weight == 1
+    assert by_points.reason is None and by_points.doubt is not None
+    assert float((by_depth.sim3 @ MOVE).log().abs().max()) > 0.1
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.3])
+def test_points_that_are_known_in_both_chunks_say_how_they_lie(wrong):
+    rng = np.random.default_rng(0)
+    points = torch.from_numpy(rng.uniform((-2, -1, 2), (2, 1, 6), (60, 3)))
+    moved = MOVE.apply(points)
+    lost = rng.choice(60, int(60 * wrong), replace=False)
+    moved[lost] += torch.from_numpy(rng.normal(0, 2, (len(lost), 3)))
+    depths = torch.stack((points[:, 2], points[:, 2] * MOVE.s))
+    seam = align_points(points, moved, depths)
+    assert seam is not None and seam.by_matches and seam.frames == 0
+    assert float((seam.sim3 @ MOVE).log().abs().max()) < 1e-6
+    assert seam.inliers == pytest.approx(1 - wrong, abs=0.05)
+
+
+def test_too_few_points_or_points_that_contradict_each_other_make_no_seam():
+    rng = np.random.default_rng(0)
+    points = torch.from_numpy(rng.uniform((-2, -1, 2), (2, 1, 6), (60, 3)))
+    depths = torch.ones(2, 60, dtype=torch.float64) * points[:, 2]
+    assert align_points(points[:9], points[:9], depths[:, :9]) is None
+    assert align_points(points, torch.from_numpy(rng.permutation(points.numpy())), depths) is None
+    assert align_points(torch.zeros(20, 3).double(), torch.zeros(20, 3).double(), depths[:, :20]) is None
 
 
 def test_a_narrow_strip_does_not_fix_a_turn():

@@ -11,6 +11,7 @@ from exact_rooms import room
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.geometry.se3 import camera_centres
 from freegeo.geometry.sim3 import Sim3
+from freegeo.sequence.alignment import align_points
 from freegeo.sequence.assembly import CONTRADICTED, assemble, broken, seams_between
 from freegeo.sequence.chunks import Chunk, bridge, plan_chunks
 from sequence.test_join import part_of, similarity
@@ -89,6 +90,23 @@ def test_seams_that_are_known_are_not_measured_again(whole):
     reads = []
     assert seams_between(chunks, reads.append, known=seams) == seams
     assert reads == []
+
+
+def test_chunks_without_a_common_frame_are_joined_by_points_that_matches_measure(whole):
+    chunks = [Chunk(frames=tuple(range(6))), Chunk(frames=tuple(range(6, FRAMES)))]
+    parts = [part_of(whole, chunk, similarity(number)) for number, chunk in enumerate(chunks)]
+    assert seams_between(chunks, parts.__getitem__) == {}
+    first, second = similarity(0), similarity(1)
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-2, 2, (40, 3)))
+    seam = align_points(first.apply(points), second.apply(points), torch.ones(2, 40, dtype=torch.float64))
+    assert seam is not None
+    found = assemble(
+        chunks, seams_between(chunks, parts.__getitem__, measured={(0, 1): seam}), parts.__getitem__
+    )  # fmt: skip
+    assert found.pieces == [[0, 1]]
+    assert float((found.sim3[1] @ second @ first.inverse()).log().abs().max()) < 1e-6
+    (joint,) = found.joints
+    assert joint.gap is None and joint.reason is None and joint.as_dict()["frames"] == 0
 
 
 def test_chunks_of_known_cameras_are_measured_and_not_moved(whole):

@@ -226,7 +226,7 @@ def test_a_seam_becomes_an_edge():
         rms=0.02,
         centre=tensor(1, 2, 3),
         depth=4.0,
-        by_cameras=False,
+        by_matches=False,
         reason=None,
         doubt=None,
     )

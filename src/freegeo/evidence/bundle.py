@@ -24,12 +24,21 @@ from freegeo.evidence.scores import depth_at
 from freegeo.evidence.tracks import MeasuredTracks, join_matches, triangulate
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.geometry.camera import project
-from freegeo.geometry.depth import valid_depth
 from freegeo.geometry.rotation import rotation_angle
 from freegeo.geometry.se3 import inverse, relative, transform_points
 from freegeo.host import sigterm_kept
 
-__all__ = ["BundleSettings", "Solution", "Start", "cluster", "depth_of", "measure", "shared_cameras", "solve"]
+__all__ = [
+    "BundleSettings",
+    "Solution",
+    "Start",
+    "cluster",
+    "depth_of",
+    "measure",
+    "points_of",
+    "shared_cameras",
+    "solve",
+]
 
 Start = Literal["rays", "depth"]
 """Where the points of the first adjustment come from: rays of the predicted cameras, or the predicted depth."""
@@ -191,12 +200,21 @@ def measure(
     return chosen, xyz[alive]
 
 
+def points_of(candidate: Candidate, matches: Matches, tracks: MeasuredTracks, views: np.ndarray) -> np.ndarray:
+    """Return points (n, 3) of tracks as some views (S,) bool measure them; nan for those that they do not fix."""
+    settings = BundleSettings()
+    own, alive = _selected(tracks, views[tracks.view])
+    xyz, error, wide = _triangulated(candidate, matches, own, settings)
+    wrong = np.bincount(own.point, weights=error > settings.narrowest_px, minlength=len(own)) > 0
+    found = np.full((len(tracks), 3), np.nan)
+    found[alive] = np.where((wide & ~wrong)[:, None], xyz, np.nan)
+    return found
+
+
 def depth_of(candidate: Candidate, tracks: MeasuredTracks) -> Tensor:
     """Predicted depth (m,) of the observations; nan where there is none."""
     view = torch.from_numpy(tracks.view)
-    depth = candidate.depth_z.detach().cpu().double()
-    pixel = candidate.in_model(view, torch.from_numpy(tracks.pixel))
-    return depth_at(torch.where(valid_depth(depth), depth, torch.nan), view, pixel)[0]
+    return depth_at(candidate.depth_z.detach().cpu(), view, candidate.in_model(view, torch.from_numpy(tracks.pixel)))[0]
 
 
 def _adjusted(
@@ -210,6 +228,7 @@ def _adjusted(
     if len(tracks) < settings.fewest_tracks:
         return None
     few, now = _longest(tracks, settings.per_photo), candidate
+    unit = float(depth_of(candidate, few).nanmedian())
     for step, gate in enumerate(settings.gates_px(matches.match_hw)):
         if step == 0 and start == "depth":
             xyz = _lifted(now, few)
@@ -224,7 +243,7 @@ def _adjusted(
         if moved is None:
             return None
         seen = np.bincount(chosen.view, minlength=len(matches)) > 0
-        now = replace(moved, T_cam_world=_following(now.T_cam_world, moved.T_cam_world, seen))
+        now = replace(moved, T_cam_world=_following(now.T_cam_world, moved.T_cam_world, seen, unit))
     xyz, error, wide = _triangulated(now, matches, tracks, settings)
     good = (error <= settings.narrowest_px) & wide[tracks.point]
     last, alive = _selected(tracks, good)
@@ -246,7 +265,7 @@ def _adjusted(
         factor, spread = float(np.exp(middle)), float(np.nanmedian(np.abs(ratio - middle)))
     T, xyz = now.T_cam_world.clone(), xyz * factor
     T[:, :3, 3] *= factor
-    now = replace(now, T_cam_world=_following(candidate.T_cam_world, T, refined))
+    now = replace(now, T_cam_world=_following(candidate.T_cam_world, T, refined, unit))
     return Solution(
         candidate=now,
         refined=refined,
@@ -402,13 +421,18 @@ def _sized(predicted: Candidate, now: Candidate, tracks: MeasuredTracks, xyz: np
     return sized
 
 
-def _following(predicted: Tensor, T_cam_world: Tensor, refined: np.ndarray) -> Tensor:
-    """Views that are not refined keep their predicted pose relative to the refined view that looks most alike."""
+def _following(predicted: Tensor, T_cam_world: Tensor, refined: np.ndarray, unit: float) -> Tensor:
+    """Views that are not refined keep their predicted pose relative to the refined view that looks most alike.
+
+    That is the one with the smallest turn, in radians, and way, in depths of the scene (`unit`).
+    """
     T_cam_world = T_cam_world.clone()
     inside = np.flatnonzero(refined)
-    R = predicted[:, :3, :3]
+    R, centre = predicted[:, :3, :3], inverse(predicted)[:, :3, 3]
     for view in np.flatnonzero(~refined).tolist():
-        near = int(inside[int(rotation_angle(R[view].expand(len(inside), 3, 3), R[inside]).argmin())])
+        turn = rotation_angle(R[view].expand(len(inside), 3, 3), R[inside])
+        way = torch.linalg.vector_norm(centre[inside] - centre[view], dim=-1) / unit
+        near = int(inside[int((turn + way.nan_to_num()).argmin())])
         T_cam_world[view] = relative(predicted[near], predicted[view]) @ T_cam_world[near]
     return T_cam_world
 

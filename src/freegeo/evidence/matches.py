@@ -36,6 +36,7 @@ __all__ = [
     "Matches",
     "Outcome",
     "choose_pairs",
+    "combined",
     "find_matches",
     "load_matches",
     "magsac",
@@ -283,6 +284,48 @@ def load_matches(file: Path) -> Matches | None:
         logger.warning("%s: the stored matches are damaged (%s); the photos are matched again.", file, error.reason)
         return None
     return found
+
+
+def combined(parts: Sequence[Matches], names: Sequence[str]) -> Matches:
+    """Put matches of overlapping parts of a scene together: those of the photos `names`, in that order.
+
+    A place of a photo is one keypoint, whatever parts have it, and of a pair that several parts have, the first counts.
+    Every photo is in one of the parts.
+    """
+    number_of = {name: view for view, name in enumerate(names)}
+    views = [np.array([number_of.get(name, -1) for name in part.names]) for part in parts]
+    photo_hw, match_hw = np.zeros((2, len(names), 2), np.int64)
+    for part, own in zip(parts, views, strict=True):
+        photo_hw[own[own >= 0]], match_hw[own[own >= 0]] = part.photo_hw[own >= 0], part.match_hw[own >= 0]
+    rows = [np.column_stack((own[part.view_of], part.keypoints)) for part, own in zip(parts, views, strict=True)]
+    places, place_of = np.unique(np.concatenate(rows), axis=0, return_inverse=True)
+    others = int(np.searchsorted(places[:, 0], 0))  # Keypoints of photos that are not wanted come first.
+    place_of, places = place_of.reshape(-1) - others, places[others:]
+    pairs: dict[tuple[int, int], tuple[np.ndarray, float]] = {}
+    tried: dict[tuple[int, int], tuple[int, int]] = {}
+    first = 0
+    for part, own in zip(parts, views, strict=True):
+        for pair, (a, b) in enumerate(own[part.pairs].tolist()):
+            ends = place_of[first + part.ends[part.pair_start[pair] : part.pair_start[pair + 1]]]
+            if min(a, b) >= 0:
+                pairs.setdefault((min(a, b), max(a, b)), (ends if a < b else ends[:, ::-1], part.flatness[pair]))
+        for (a, b), *facts in zip(own[part.tried].tolist(), part.outcome, part.candidates, strict=True):
+            if min(a, b) >= 0:
+                tried.setdefault((min(a, b), max(a, b)), (int(facts[0]), int(facts[1])))
+        first += len(part.keypoints)
+    ordered, compared = sorted(pairs), sorted(tried)
+    return Matches(
+        names=tuple(names), photo_hw=photo_hw, match_hw=match_hw, keypoints=places[:, 1:],
+        view_start=np.searchsorted(places[:, 0], np.arange(len(names) + 1)),
+        pairs=np.array(ordered, np.int64).reshape(-1, 2),
+        pair_start=np.cumsum([0, *(len(pairs[pair][0]) for pair in ordered)]),
+        ends=np.concatenate([np.zeros((0, 2), np.int64), *(pairs[pair][0] for pair in ordered)]),
+        flatness=np.array([pairs[pair][1] for pair in ordered], float),
+        tried=np.array(compared, np.int64).reshape(-1, 2),
+        outcome=np.array([tried[pair][0] for pair in compared], np.int64),
+        candidates=np.array([tried[pair][1] for pair in compared], np.int64),
+        fingerprint=hashlib.sha256("".join(part.fingerprint for part in parts).encode()).hexdigest(),
+    )  # fmt: skip
 
 
 def _is_sound(found: Matches) -> bool:

@@ -29,7 +29,6 @@ from freegeo.evidence.scores import depth_at, epipolar
 from freegeo.evidence.tracks import MeasuredTracks, join_matches
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.fusion.tracks import Tracks
-from freegeo.geometry.depth import valid_depth
 from freegeo.geometry.se3 import inverse, relative, transform_points
 
 __all__ = [
@@ -37,6 +36,7 @@ __all__ = [
     "RefineSettings",
     "Refinement",
     "bring_depth",
+    "depth_factors",
     "depth_misfit",
     "measured_depth",
     "parallax_px",
@@ -211,13 +211,11 @@ def bring_depth(
     Raises:
         ValueError: the refinement was not accepted.
     """
-    tracks, T_cam_world, K = refinement.tracks, refinement.T_cam_world, refinement.K
-    if not refinement.accepted or tracks is None or T_cam_world is None or K is None:
-        raise ValueError(f"a refinement that was not accepted is not used: {refinement.reason}")
-    measured, predicted = _depths(reconstruction, tracks, T_cam_world)
-    factors, own = _view_factors(measured, predicted, tracks.view, len(reconstruction))
+    tracks, T_cam_world, K = _accepted(refinement)
+    factors, own = depth_factors(reconstruction, refinement)
     depth_z = reconstruction.depth_z * factors[:, None, None].astype(np.float32)
     if affine:
+        measured, predicted = _depths(reconstruction, tracks, T_cam_world)
         known = np.isfinite(measured) & np.isfinite(predicted)
         counts = np.bincount(tracks.view[known], minlength=len(reconstruction))
         for view in np.flatnonzero(counts >= FEWEST_AFFINE).tolist():
@@ -233,6 +231,23 @@ def bring_depth(
         )  # fmt: skip
     moved = replace(reconstruction, depth_z=depth_z, T_cam_world=T_cam_world.astype(np.float32), K=K.astype(np.float32))
     return moved, without
+
+
+def depth_factors(reconstruction: Reconstruction, refinement: Refinement) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much each view's depth is multiplied (S,), and whether it has tracks enough for that (S,) bool.
+
+    As `bring_depth`, which also makes a reconstruction of it. ValueError for a refinement that was not accepted.
+    """
+    tracks, T_cam_world, _ = _accepted(refinement)
+    return _view_factors(*_depths(reconstruction, tracks, T_cam_world), tracks.view, len(reconstruction))
+
+
+def _accepted(refinement: Refinement) -> tuple[Tracks, np.ndarray, np.ndarray]:
+    """Return tracks, extrinsics and intrinsics."""
+    tracks, T_cam_world, K = refinement.tracks, refinement.T_cam_world, refinement.K
+    if not refinement.accepted or tracks is None or T_cam_world is None or K is None:
+        raise ValueError(f"a refinement that was not accepted is not used: {refinement.reason}")
+    return tracks, T_cam_world, K
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -447,8 +462,7 @@ def _depths(reconstruction: Reconstruction, tracks: Tracks, T_cam_world: np.ndar
     """Depth (m,) of the tracks in their views, and the predicted depth there."""
     T = torch.from_numpy(T_cam_world)[tracks.view]
     measured = transform_points(T, torch.from_numpy(tracks.xyz)[tracks.point])[:, 2]
-    depth = torch.from_numpy(reconstruction.depth_z).double()
-    depth = torch.where(valid_depth(depth), depth, torch.nan)
+    depth = torch.from_numpy(reconstruction.depth_z)
     predicted, _ = depth_at(depth, torch.from_numpy(tracks.view), torch.from_numpy(tracks.pixel))
     return measured.numpy(), predicted.numpy()
 

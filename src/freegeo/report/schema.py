@@ -93,12 +93,20 @@ class Loop(TypedDict):
     used: bool
 
 
+class Together(TypedDict):
+    """The bundle adjustment of all photos of a piece."""
+
+    accepted: bool
+
+
 class PieceRecord(TypedDict, total=False):
     """A part of a sequence that was joined."""
 
     folder: Required[str]
     ranges: list[list[int]]
     """First and last frame of each run of frames that the piece has."""
+    together: Together | None
+    """What became of the bundle adjustment of all its photos."""
 
 
 class SequenceRecord(TypedDict):

@@ -172,6 +172,13 @@ def _sentences(sequence: Mapping[str, Any]) -> list[str]:
     refined = [chunk["refined"] for chunk in chunks if chunk.get("refined") is not None]
     if refined:
         found.append(f"{sum(refined)} of {_count(len(refined), 'chunk')} refined.")
+    together = [piece["together"]["accepted"] for piece in pieces if piece.get("together")]
+    if together:
+        what = "All photos" if len(pieces) == 1 else f"{sum(together)} of {len(pieces)} pieces"
+        found.append(f"{what} refined together." if any(together) else "No piece refined as a whole.")
+    spare = [chunk["number"] for chunk in chunks if chunk["piece"] is None and _is_spare(chunk, sequence)]
+    if spare:
+        found.append(f"{_count(len(spare), 'chunk')} left out: surer ones have these frames.")
     found.append(_seam_sentence(sequence))
     used = sum(bool(loop["used"]) for loop in loops)
     refused = sum(seam["kind"] == "loop" and not seam["used"] for seam in seams)
@@ -205,7 +212,7 @@ def _problems(sequence: Mapping[str, Any]) -> list[str]:
     found = [
         f"Chunk {chunk['number']} ({frames_of[chunk['number']]}) is missing{_because(chunk['reason'])}"
         for chunk in sequence["chunks"]
-        if chunk["piece"] is None
+        if chunk["piece"] is None and not _is_spare(chunk, sequence)
     ]
     seam_of = {(seam["first"], seam["second"]): seam for seam in sequence["seams"]}
     neighbours = pairwise(chunk["number"] for chunk in sequence["chunks"])
@@ -217,6 +224,13 @@ def _problems(sequence: Mapping[str, Any]) -> list[str]:
     if len(found) > MOST_NAMED:
         found[MOST_NAMED:] = [f"So it is at {len(found) - MOST_NAMED} more places; see the seams below."]
     return found
+
+
+def _is_spare(chunk: Mapping[str, Any], sequence: Mapping[str, Any]) -> bool:
+    """Whether the result has the frames of a chunk that has no part in it."""
+    ranges = (run for piece in sequence["pieces"] for run in piece["ranges"])
+    shown = {frame for first, last in ranges for frame in range(first, last + 1)}
+    return shown.issuperset(range(chunk["first"], chunk["last"] + 1))
 
 
 def _because(reason: str | None) -> str:

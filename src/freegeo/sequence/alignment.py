@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -18,9 +19,9 @@ from torch import Tensor
 from freegeo.errors import FreeGeoError
 from freegeo.fusion.settings import FilterSettings
 from freegeo.geometry.se3 import camera_centres, inverse, transform_points
-from freegeo.geometry.sim3 import DegenerateAlignmentError, ScaleRule, Sim3, fit_cameras, umeyama
+from freegeo.geometry.sim3 import DegenerateAlignmentError, ScaleRule, Sim3, umeyama
 
-__all__ = ["FEWEST_INLIERS", "INLIER", "Depths", "Seam", "align", "gap"]
+__all__ = ["FEWEST_INLIERS", "INLIER", "Depths", "Seam", "align", "align_points", "gap"]
 
 INLIER = 0.1
 """Two points of one pixel agree when they are closer than this share of the pixel's depth."""
@@ -32,9 +33,8 @@ LARGEST_SCALE = 20.0
 """A chunk that is larger or smaller than its neighbour by more than this factor is not believed."""
 LARGEST_LEVERAGE = 0.5
 """Largest residual, relative to the second largest extent of the shared points: narrower ones leave a turn open."""
-CAMERAS_APART, CAMERAS_TURNED_DEG = 0.1, 5.0
-"""Median differences of the cameras of shared frames up to which those of two chunks agree: distance, as a share of the
-longest one between them, and angle."""
+FEWEST_POINTS, POINT_INLIERS = 10, 0.5
+"""So many points that matches measure in both chunks, and this share of them, have to agree to make a seam."""
 BLANK = 2.0
 """Standard deviation of the colours (0 to 255) below which a frame shows nothing."""
 
@@ -43,6 +43,8 @@ _KERNEL_MEDIANS = 1.5
 _WIDEST_KERNEL = 0.05
 _MOST_STEPS = 50
 _CONVERGED = 1e-6
+_DRAWS, _DRAWN = 100, 4
+"""Starts of `align_points`, and points of each."""
 
 
 class Depths(Protocol):
@@ -105,8 +107,8 @@ class Seam:
     """Mean (3,) of the shared points in the second chunk's frame."""
     depth: float
     """Median depth of the shared pixels in the second chunk's units."""
-    by_cameras: bool
-    """Whether the cameras of the shared frames make the seam, not their points."""
+    by_matches: bool
+    """Whether points that matches measure make the seam, not the depth of shared frames."""
     reason: str | None
     """A sentence that says why the seam cannot be used; None: it can."""
     doubt: str | None
@@ -115,7 +117,7 @@ class Seam:
     @property
     def weight(self) -> float:
         """How much the seam counts where it meets others."""
-        return 1.0 if self.by_cameras else self.inliers
+        return 1.0 if self.by_matches else self.inliers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +130,7 @@ class _Shared:
     depth_second: Tensor
     weights: Tensor
     starts: list[Sim3]
-    """For each frame, where its two cameras and its median depth put the second chunk."""
+    """Where to begin: for each frame, where its two cameras and its median depth put the second chunk."""
 
     def residuals(self, sim3: Sim3) -> Tensor:
         """Distances (N,) of the two points of a pixel, relative to the geometric mean of its two depths.
@@ -146,7 +148,7 @@ def align(
     rows: Sequence[tuple[int, int]],
     *,
     fixed_scale: bool = False,
-    measured: bool = False,
+    measured: Sim3 | None = None,
 ) -> Seam:
     """Find how the chunk `second` lies in the frame of `first`.
 
@@ -158,8 +160,8 @@ def align(
         second: the chunk that moves.
         rows: for each frame in both, its row in `first` and in `second`.
         fixed_scale: lengths of both are in one unit (metric models, known cameras), so the scale is 1.
-        measured: cameras of both are refined by matches, and surer than depth: the shared frames' cameras make the
-            seam, if those of both chunks agree.
+        measured: the seam by points that matches measure in both (`align_points`), which are surer than depth; only
+            how well surfaces fit there is looked at.
 
     Returns:
         The seam; `reason` says why it cannot be trusted.
@@ -179,10 +181,9 @@ def align(
     count = 0 if shared is None else len(shared.weights)
     if shared is None or count < FEWEST_PIXELS:
         return _nothing(len(shown), count, f"only {count} pixels of the shared frames have a depth in both chunks.")
-    sim3 = _fit_cameras(first, second, shown) if measured and not fixed_scale else None
-    by_cameras = sim3 is not None
+    by_matches = measured is not None
     try:
-        sim3 = sim3 or _fit(shared, "one" if fixed_scale else "symmetric")
+        sim3 = measured or _fit(shared, "one" if fixed_scale else "symmetric")
     except DegenerateAlignmentError:
         return _nothing(len(shown), count, "the points of the shared frames lie on one line or in one place.")
     residuals = shared.residuals(sim3)
@@ -198,16 +199,55 @@ def align(
         rms=rms,
         centre=shared.second.mean(0),
         depth=depth,
-        by_cameras=by_cameras,
-        reason=None if by_cameras else _refusal(sim3, inliers, rms, _narrowness(shared.second[inlying] / depth)),
-        doubt=_doubt(inliers, by_cameras=by_cameras),
+        by_matches=by_matches,
+        reason=None if by_matches else _refusal(sim3, inliers, rms, _narrowness(shared.second[inlying] / depth)),
+        doubt=_doubt(inliers, by_matches=by_matches),
     )
+
+
+def align_points(first: Tensor, second: Tensor, depths: Tensor, *, fixed_scale: bool = False) -> Seam | None:
+    """Find how a chunk lies in the frame of another by points that are known in both; wrong ones do no harm.
+
+    Args:
+        first: points (N, 3) in the frame of the chunk that stays.
+        second: the same points in the frame of the other chunk.
+        depths: (2, N) how far each is from the cameras of the two chunks.
+        fixed_scale: as for `align`.
+
+    Returns:
+        The seam, of no shared frames; None where too few points agree.
+    """
+    rng, rule = np.random.default_rng(0), "one" if fixed_scale else "symmetric"
+    starts = []
+    for _ in range(_DRAWS if len(first) >= FEWEST_POINTS else 0):
+        drawn = rng.choice(len(first), _DRAWN, replace=False)
+        with suppress(DegenerateAlignmentError):
+            starts.append(umeyama(second[drawn], first[drawn], scale=rule))
+    if not starts:
+        return None
+    shared = _Shared(
+        first=first, second=second, depth_first=depths[0], depth_second=depths[1],
+        weights=torch.ones(len(first), dtype=torch.float64), starts=starts,
+    )  # fmt: skip
+    try:
+        sim3 = _fit(shared, rule)
+    except DegenerateAlignmentError:
+        return None
+    residuals = shared.residuals(sim3)
+    inlying = residuals < INLIER
+    inliers = float(inlying.double().mean())
+    if int(inlying.sum()) < FEWEST_POINTS or inliers < POINT_INLIERS:
+        return None
+    return Seam(
+        sim3=sim3, frames=0, pixels=len(first), inliers=inliers, rms=float(residuals[inlying].square().mean().sqrt()),
+        centre=second.mean(0), depth=float(depths[1].median()), by_matches=True, reason=None, doubt=None,
+    )  # fmt: skip
 
 
 def gap(
     first: Depths, second: Depths, rows: Sequence[tuple[int, int]], place_first: Sim3, place_second: Sim3
 ) -> float | None:
-    """Median distance between the two places of a shared pixel, relative to its depth.
+    """Median distance between the two places of a shared pixel, relative to its depth; None without shared frames.
 
     Args:
         first: a chunk.
@@ -219,7 +259,7 @@ def gap(
     Returns:
         The median, or None where the chunks have no pixel in common.
     """
-    shared = _shared(first, second, rows, fixed_scale=True)
+    shared = _shared(first, second, rows, fixed_scale=True) if rows else None
     return None if shared is None else float(shared.residuals(place_first.inverse() @ place_second).median())
 
 
@@ -232,7 +272,7 @@ def _nothing(frames: int, pixels: int, reason: str) -> Seam:
         rms=math.nan,
         centre=torch.zeros(3, dtype=torch.float64),
         depth=1.0,
-        by_cameras=False,
+        by_matches=False,
         reason=reason,
         doubt=None,
     )
@@ -332,21 +372,6 @@ def _fit(shared: _Shared, scale: ScaleRule) -> Sim3:
     return sim3
 
 
-def _fit_cameras(first: Depths, second: Depths, rows: Sequence[tuple[int, int]]) -> Sim3 | None:
-    """Fit the shared frames' cameras to each other; None where they give no scale, or do not agree."""
-    T_first, T_second = (
-        torch.from_numpy(np.asarray(chunk.cameras()[0][[row[side] for row in rows]], np.float64))
-        for side, chunk in enumerate((first, second))
-    )
-    try:
-        fit = fit_cameras(T_second, T_first)
-    except DegenerateAlignmentError:
-        return None
-    if fit.position is None or fit.position > CAMERAS_APART or fit.rotation_deg > CAMERAS_TURNED_DEG:
-        return None
-    return fit.sim3
-
-
 def _narrowness(points: Tensor) -> float:
     """Second largest extent (standard deviation) of points (N, 3): how far they are from lying on a line."""
     if len(points) < 3:
@@ -368,10 +393,10 @@ def _refusal(sim3: Sim3, inliers: float, rms: float, extent: float) -> str | Non
     return None
 
 
-def _doubt(inliers: float, *, by_cameras: bool) -> str | None:
+def _doubt(inliers: float, *, by_matches: bool) -> str | None:
     if inliers >= DOUBTFUL_INLIERS:
         return None
-    if by_cameras:
+    if by_matches:
         return (
             f"the cameras fit, as matches measure them, and surfaces do not: {inliers:.0%} of the shared pixels agree."
         )

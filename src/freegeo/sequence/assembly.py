@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
@@ -76,26 +76,27 @@ def seams_between(
     load: Load,
     *,
     fixed_scale: bool = False,
-    measured: Collection[int] = (),
+    measured: Mapping[tuple[int, int], Seam] | None = None,
     known: Seams | None = None,
 ) -> dict[tuple[int, int], Seam]:
-    """Align every two chunks that share frames.
+    """Align every two chunks that share frames, or that measured points join.
 
     Args:
         chunks: those of the sequence in its order, and those that tie it together.
         load: reads the prediction of a chunk by its number here.
         fixed_scale: lengths of all chunks have one unit, such as metres: seams turn and move only.
-        measured: numbers of the chunks whose cameras are refined by matches.
+        measured: seams by points that matches measure in two chunks (`align_points`).
         known: seams that were measured before.
     """
-    read, found = lru_cache(maxsize=_OPEN)(load), dict(known or {})
+    read, found, by_points = lru_cache(maxsize=_OPEN)(load), dict(known or {}), measured or {}
     for pair in combinations(range(len(chunks)), 2):
-        rows = common_rows(*(chunks[number] for number in pair))
+        rows, own = common_rows(*(chunks[number] for number in pair)), by_points.get(pair)
         if rows and pair not in found:
             found[pair] = align(
-                read(pair[0]), read(pair[1]), rows, fixed_scale=fixed_scale,
-                measured=all(number in measured for number in pair),
-            )  # fmt: skip
+                read(pair[0]), read(pair[1]), rows, fixed_scale=fixed_scale, measured=None if own is None else own.sim3
+            )
+        elif own is not None:
+            found.setdefault(pair, own)
     return found
 
 

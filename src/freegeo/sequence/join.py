@@ -61,11 +61,17 @@ class Joined:
         self._usable = lru_cache(maxsize=_OPEN)(lambda number: self._open(number).valid_pixels())
         self.T_cam_world, self.K = self._cameras()
 
-    def blocks(self, name: str, factor: float = 1.0) -> Iterator[np.ndarray] | None:
-        """Yield `depth_z` (times a factor), `conf`, `images` or `sky` frame by frame, each (1, ...); None: no sky."""
+    def blocks(self, name: str, factors: np.ndarray | None = None) -> Iterator[np.ndarray] | None:
+        """Yield `depth_z`, `conf`, `images` or `sky` frame by frame, each (1, ...); None: no sky.
+
+        Depth is multiplied by the factor of its frame, of `factors` (n,).
+        """
         if name == "sky" and self._open(0).sky is None:
             return None
-        joins = {"depth_z": lambda frame: self._depth(frame) * np.float32(factor), "conf": self._conf}
+        factor_of = {} if factors is None else dict(zip(self.frames, factors, strict=True))
+        joins = {
+            "depth_z": lambda frame: self._depth(frame) * np.float32(factor_of.get(frame, 1.0)), "conf": self._conf,
+        }  # fmt: skip
         join = joins.get(name, lambda frame: self._best(name, frame))
         return (join(frame)[None] for frame in self.frames)
 
