@@ -85,7 +85,7 @@ def test_a_chunk_whose_frames_surer_ones_have_is_no_problem(tmp_path):
     told = sequence.told(found)
     assert told.problems == []
     assert "1 chunk left out: surer ones have these frames." in told.sentences
-    assert "All photos refined together." in told.sentences
+    assert "All photos refined together, from where the seams put them." in told.sentences
 
 
 def test_seams_of_loops_and_chunks_without_a_seam_are_told(pieces):

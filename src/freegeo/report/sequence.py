@@ -175,7 +175,11 @@ def _sentences(sequence: Mapping[str, Any]) -> list[str]:
     together = [piece["together"]["accepted"] for piece in pieces if piece.get("together")]
     if together:
         what = "All photos" if len(pieces) == 1 else f"{sum(together)} of {len(pieces)} pieces"
-        found.append(f"{what} refined together." if any(together) else "No piece refined as a whole.")
+        found.append(
+            f"{what} refined together, from where the seams put them."
+            if any(together)
+            else "No piece refined as a whole."
+        )
     spare = [chunk["number"] for chunk in chunks if chunk["piece"] is None and _is_spare(chunk, sequence)]
     if spare:
         found.append(f"{_count(len(spare), 'chunk')} left out: surer ones have these frames.")
