@@ -1,12 +1,16 @@
 """Long sequences: accuracy, memory and robustness on a generated walk that comes back to its start.
 
-Run: python benchmarks/sequences.py PART [--frames 300] [--seed 20000000] [--alike] [--refine] [--work FOLDER]
+Run: python benchmarks/sequences.py PART [--frames 300] [--first N] [--seed 20000000] [--alike] [--refine]
+    [--work FOLDER]
 
 `chunks`: what the embedded model does with chunks of several sizes, each alone: errors of cameras and depth.
 `exact`:  true depth and cameras; each chunk in its own random similarity frame, with noise and outliers. How far the
           seams and the graph are from the truth, without a loop, with a true one, and with a false one.
 `walk`:   error of the whole trajectory by chunk size, overlap and loops; with --refine, of chunks that are refined by
-          matches (docs/refinement.md), with half of a chunk shared.
+          matches (docs/refinement.md), with half of a chunk shared. With --first, of the first N frames only, with half
+          of a chunk shared.
+`poses`:  error of the first 60 frames (--first) in chunks of 12 when true poses of 0, 3, 6 and 12 of them are known,
+          evenly spread, with one of twelve wrong, and of 6 pairs of neighbours.
 `memory`: peak memory of a fresh process against the number of frames, with a figure.
 `film`:   writes a walk as a video (--out FILE.mp4), by default of 1,000 frames.
 `video`:  time and peak memory of a video of 1,000 frames.
@@ -37,6 +41,7 @@ from record import write_result
 
 from freegeo.data.procedural import Walk, walk
 from freegeo.export.reconstruction import Reconstruction
+from freegeo.geometry.rotation import rotation_angle
 from freegeo.geometry.se3 import camera_centres
 from freegeo.geometry.sim3 import Sim3, align_cameras
 from freegeo.metrics.pose import pair_errors, pose_auc
@@ -45,7 +50,16 @@ from freegeo.training.pool import image_size
 
 DOMAIN = "test-id"
 MODEL_HW = image_size(embedded_spec().default_side, (3, 4), embedded_spec().patch_size)
-ALL_FRAMES = {"walk": 300, "memory": 300, "exact": 300, "chunks": 300, "film": 1000, "video": 1000, "kill": 300}
+ALL_FRAMES = {
+    "walk": 300,
+    "poses": 300,
+    "memory": 300,
+    "exact": 300,
+    "chunks": 300,
+    "film": 1000,
+    "video": 1000,
+    "kill": 300,
+}
 KILLS = 6
 DELIVERED = (0, 3)
 """Exit codes with a result; 3: in pieces."""
@@ -201,11 +215,13 @@ def moved_chunk(
 def whole_walk(arguments: argparse.Namespace) -> list[dict]:
     """Reconstruct the walk with several plans."""
     around = walk(arguments.seed, DOMAIN, arguments.frames, alike=arguments.alike)
-    photos = written_photos(around, arguments.work / f"photos-{'alike' if arguments.alike else 'plain'}")
+    kind = "alike" if arguments.alike else "plain"
+    folder = f"photos-{kind}-{arguments.seed}-{arguments.first or arguments.frames}"
+    photos = written_photos(around, arguments.work / folder, arguments.first)
     rows = []
     more = ["--refine", "ba"] if arguments.refine else []
-    for size in (12, 16):
-        for overlap in (size // 2,) if arguments.refine else (size // 2, size // 4):
+    for size in (8, 12, 16):
+        for overlap in (size // 2,) if arguments.refine or arguments.first else (size // 2, size // 4):
             for loops in (True, False):
                 name = f"{photos.name}-{size}-{overlap}-{'loops' if loops else 'no-loops'}"
                 out = photos.parent / (f"{name}-refined" if arguments.refine else name)
@@ -228,9 +244,65 @@ def walk_scores(out: Path, around: Walk) -> dict:
         "frames": len(frames),
         "pieces": len(told["pieces"]),
         "seams_left_out": sum(not seam["used"] for seam in told["seams"]),
+        "doubtful": sum(seam["used"] and bool(seam["reason"]) for seam in told["seams"]),
         "loops_used": sum(loop["used"] for loop in told["loops"]),
         "loops_refused": sum(not loop["used"] for loop in told["loops"]),
     }
+
+
+def known_poses(arguments: argparse.Namespace) -> list[dict]:
+    """Reconstruct the first frames of the walk with known poses of some; the predictions are the same for all."""
+    around, count = walk(arguments.seed, DOMAIN, arguments.frames), arguments.first or 60
+    photos = written_photos(around, arguments.work / f"photos-plain-{arguments.seed}-{count}", count)
+    out, rows = arguments.work / f"{photos.name}-poses", []
+    spread = {n: np.linspace(0, count - 1, n + 2)[1:-1].round().astype(int).tolist() for n in (3, 6, 12)}
+    wrong = spread[12][5]
+    pairs = sorted({frame + step for frame in spread[6] for step in (0, 1)})
+    for name, frames in {"none": [], **spread, "12, one wrong": spread[12], "6 pairs of neighbours": pairs}.items():
+        more = []
+        if frames:
+            cameras = arguments.work / f"{photos.name}.json"
+            shown = {frame: spread[12][0] if name == "12, one wrong" and frame == wrong else frame for frame in frames}
+            write_poses(cameras, around, shown)
+            more = ["--cameras", str(cameras), "--trust-cameras"]
+        plan = ["--chunk", "12", "--overlap", "6", "--order", "given", "--formats", "npz"]
+        process = subprocess.run(command([*plan, *more], photos, out), check=False)
+        if process.returncode not in DELIVERED:
+            raise SystemExit(f"{out}: freegeo ended with {process.returncode}")
+        rows.append({"poses": name} | posed_scores(out, around, frames))
+        print(json.dumps(rows[-1]), flush=True)
+    return rows
+
+
+def write_poses(path: Path, around: Walk, shown: dict[int, int]) -> None:
+    """Write the true poses of some photos, each that of the frame it is said to have."""
+    known = [
+        {"name": around.photos[frame].name, "w2c": around.T_cam_world[given].double().tolist()}
+        for frame, given in shown.items()
+    ]
+    path.write_text(json.dumps({"frames": known}))
+
+
+def posed_scores(out: Path, around: Walk, frames: list[int]) -> dict:
+    """Errors of the frames without a known pose, in the frame and scale of the known ones where there are some.
+
+    Positions relative to the way, as `walk_scores` has them of all frames after one alignment, and angles.
+    """
+    about = json.loads((out / "reconstruction.json").read_text())
+    result = Reconstruction.load(out)
+    views = [int(Path(name).stem) for name in result.names]
+    truth, T = around.T_cam_world[views].double(), torch.from_numpy(np.array(result.T_cam_world)).double()
+    way = float(camera_centres(truth).diff(dim=0).norm(dim=-1).sum())
+    known = about["known_cameras"] or {}
+    free = [row for row, view in enumerate(views) if view not in frames or not known.get("poses")]
+    row = {"frames": len(views), "pieces": len(about["sequence"]["pieces"]), "aligned": trajectory_error(T, truth)[0]}
+    if known.get("poses"):
+        off = (camera_centres(T) - camera_centres(truth))[free]
+        turned = rotation_angle(T[free, :3, :3], truth[free, :3, :3])
+        row |= {"in_world": float(off.square().sum(-1).mean().sqrt()) / way, "turned": float(turned.median().rad2deg())}
+        row |= {"residual_deg": known["rotation_deg"], "residual": known["position"]}
+        row |= {"untied": f"{known['untied']} of {known['chunks']}", "odd": len(known["odd"])}
+    return row
 
 
 def written_photos(around: Walk, folder: Path, count: int | None = None) -> Path:
@@ -352,7 +424,15 @@ def kill(arguments: argparse.Namespace) -> list[dict]:
     return rows
 
 
-PARTS = {"chunks": chunks, "exact": exact, "walk": whole_walk, "memory": memory, "video": video, "kill": kill}
+PARTS = {
+    "chunks": chunks,
+    "exact": exact,
+    "walk": whole_walk,
+    "poses": known_poses,
+    "memory": memory,
+    "video": video,
+    "kill": kill,
+}
 
 
 def table(rows: list[dict]) -> str:
@@ -384,6 +464,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("part", choices=[*PARTS, "film", "report"])
     parser.add_argument("--frames", type=int, help="of the walk")
+    parser.add_argument("--first", type=int, help="walk, poses: reconstruct only so many frames, the first ones")
     parser.add_argument("--seed", type=int, default=20_000_000)
     parser.add_argument("--alike", action="store_true", help="walk: two rooms look alike")
     parser.add_argument("--refine", action="store_true", help="walk: refine chunks by matches")

@@ -28,16 +28,19 @@ from freegeo.geometry.sim3 import DegenerateAlignmentError, Sim3, fit_cameras
 from freegeo.models.precision import Compute
 from freegeo.models.priors import usable_by_both
 from freegeo.posed import (
+    check_known,
     digest,
     doubt_focal_length,
     is_measurable,
     known_cameras,
     priors_of,
     told,
+    told_in_chunks,
     told_of,
     undistorted_masks,
     with_known_cameras,
     with_measured_depth,
+    with_poses,
 )
 from tiny_models import (
     attach,
@@ -531,3 +534,51 @@ def test_focal_lengths_far_from_the_exif_data_are_doubted(tmp_path, caplog, fact
         Image.new("RGB", (width, height), (40 * k, 90, 30)).save(tmp_path / f"{k}.jpg", exif=exif)
     doubt_focal_length(scene, freegeo.load_photos(tmp_path))
     assert ("EXIF data" in caplog.text) is said
+
+
+def poses_of(T: torch.Tensor, *views: int) -> KnownCameras:
+    cameras = tuple(KnownCamera(T_cam_world=T[k].numpy() if k in views else None) for k in range(len(T)))
+    return KnownCameras(names=tuple(map(str, range(len(T)))), cameras=cameras, source="poses")
+
+
+def test_frames_between_known_poses_follow_them():
+    """A path that drifts evenly away is the true one where its ends are known, and the known poses are exact."""
+    true, frames = along(8), [0, 1, 3, 4, 5, 6, 8, 9]
+    known = poses_of(true, 1, 6)
+    drifted = []
+    for frame, T in zip(frames, true, strict=True):
+        centre = camera_centres(T) + frame * torch.tensor([0.02, 0, 0.01], dtype=torch.float64)
+        R = T[:3, :3] @ Sim3.exp(torch.tensor([0, 0.02 * frame, 0, 0, 0, 0, 0], dtype=torch.float64)).R
+        drifted.append(from_Rt(R, -R @ centre))
+    found = with_poses(torch.stack(drifted).numpy(), frames, known, 2.0, None)
+    np.testing.assert_array_equal(found.T_cam_world[[1, 6]], true[[1, 6]].numpy())
+    np.testing.assert_allclose(found.T_cam_world[1:7], true[1:7].numpy(), atol=1e-9)
+    assert found.scale is None and found.about["scale"] == 2
+    assert found.about["rotation_deg"] == pytest.approx(np.rad2deg(0.02 * 4.5), rel=1e-3)
+
+
+def test_of_many_photos_only_those_with_known_poses_are_matched(monkeypatch):
+    seen = []
+    monkeypatch.setattr("freegeo.posed.find_matches", lambda photos, pairs: seen.append((photos, pairs)) or 0)
+    monkeypatch.setattr("freegeo.posed.check_convention", lambda known, matches: seen.append(known) or Accepted())
+    assert check_known(poses_of(along(18), 2, 9, 17), list(range(18))) is None
+    (photos, pairs), known = seen
+    assert photos == [2, 9, 17] and len(known) == 3 and known.has_pose.all()
+    assert pairs.tolist() == [[0, 1], [0, 2], [1, 2]]
+
+
+class Accepted:
+    sentence = "fine"
+
+    def require(self):
+        pass
+
+
+def test_each_chunk_is_told_the_poses_it_can_take_whatever_the_first_photo_lacks(photos):
+    model, known = tiny_mapanything(), known_for(photos)
+    known, batch = known.without_poses([0, 1]), model.preprocess(photos)
+    assert told(known, batch, model.spec)[0].T_cam_world is None
+    priors, sentence = told_in_chunks(known, batch, model.spec)
+    assert (
+        priors.T_cam_world is not None and f"the poses of {VIEWS - 2} and the intrinsics of {VIEWS} photos" in sentence
+    )

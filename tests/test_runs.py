@@ -65,7 +65,7 @@ def test_photos_that_fit_are_predicted_at_once_as_by_reconstruct(tmp_path):
     [
         ({"recipe": "scene", "adapter": "adapter"}, "Leave out one of them"),
         ({"chunk": "auto"}, "chunk is a number of photos, or None"),
-        ({"chunk": 0}, "--chunk must be at least 2"),
+        ({"chunk": 0}, r"a chunk has at least 2 photos \(--chunk\)"),
         ({"loops": "no"}, "loops is True or False, not 'no'"),
         ({"guard": "foo"}, "guard is select, report, off, not 'foo'"),
         ({"order": "name"}, "order is auto, given, similar"),

@@ -26,8 +26,9 @@ from freegeo.evidence.refinement import measured_depth
 from freegeo.export.photos import own_file
 from freegeo.export.pixels import HALF
 from freegeo.export.reconstruction import Reconstruction, Scale
-from freegeo.geometry.se3 import camera_centres
-from freegeo.geometry.sim3 import NORMAL, CameraFit, DegenerateAlignmentError, fit_cameras
+from freegeo.geometry.rotation import rotation_angle
+from freegeo.geometry.se3 import camera_centres, from_Rt
+from freegeo.geometry.sim3 import NORMAL, CameraFit, DegenerateAlignmentError, Sim3, fit_cameras
 from freegeo.models.priors import usable
 from freegeo.models.spec import ModelSpec
 from freegeo.types import ImageBatch, PhotoLike, Priors
@@ -98,9 +99,14 @@ def check_known(known: KnownCameras, photos: Sequence[PhotoLike], store: Path | 
     """
     if known.has_pose.sum() < 2:
         return None
+    few = len(photos) <= ALL_PAIRS_UP_TO
+    if not few:
+        # Those without a pose say nothing of the others, between which pairs may be left out.
+        views = np.flatnonzero(known.has_pose).tolist()
+        known, photos = known.select(views), [photos[view] for view in views]
     pairs = pairs_to_check(len(photos))
     # Of more photos other pairs are matched later, by what the prediction says that they see of each other.
-    store = store if len(photos) <= ALL_PAIRS_UP_TO else None
+    store = store if few else None
     is_there = store is not None and store.is_file()
     matches = stored_matches(store, photos, pairs) if store is not None and is_there else find_matches(photos, pairs)
     found = check_convention(known, matches)
@@ -108,7 +114,7 @@ def check_known(known: KnownCameras, photos: Sequence[PhotoLike], store: Path | 
     logger.info("%s", found.sentence)
     if store is not None and not is_there:
         matches.save(store)
-    return matches if len(photos) <= ALL_PAIRS_UP_TO else None
+    return matches if few else None
 
 
 def digest(known: KnownCameras) -> str:
@@ -146,6 +152,11 @@ def told_in_chunks(known: KnownCameras | None, batch: ImageBatch, spec: ModelSpe
     The priors may hold what the model can take in some chunks only (`freegeo.models.priors.usable`).
     """
     priors, sentence = told(known, batch, spec)
+    if known is not None and spec.takes == "parts" and known.has_pose.any() and not known.has_pose.all():
+        return priors_of(known, batch), (
+            f"{spec.name} is told, in each chunk, what it can take of the poses of {int(known.has_pose.sum())} and the "
+            f"intrinsics of {int(known.has_K.sum())} photos in {known.source}."
+        )
     if known is None or priors is not None or spec.takes != "cameras":
         return priors, sentence
     whole = int((known.has_pose & known.has_K).sum())
@@ -249,6 +260,60 @@ def with_known_cameras(prediction: Reconstruction, known: KnownCameras) -> Posed
     }  # fmt: skip
     result = replace(prediction, depth_z=depth_z, T_cam_world=T.numpy(), K=K.numpy(), scale=scale)
     return Posed(result=result, about=about)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tied:
+    """Cameras of photos that were predicted in chunks, in the world of the known ones among them."""
+
+    T_cam_world: np.ndarray
+    scale: Scale | None
+    """What lengths being metres rests on; None: up to scale."""
+    about: Mapping[str, Any]
+    """`scale`, `rotation_deg` and `position`, as in `Posed.about`."""
+
+
+def with_poses(
+    T_cam_world: np.ndarray, frames: Sequence[int], known: KnownCameras, factor: float, scale: Scale | None
+) -> Tied:
+    """Return known poses of some frames of a sequence as they were given, and let the frames between them follow.
+
+    What a known pose lacks to the one it takes the place of is a turn and a shift; frames between two known poses are
+    turned and shifted by what lies between these, so that the path and its surfaces have no jumps. Warnings say where
+    the cameras were far from the known ones.
+
+    Args:
+        T_cam_world: (S, 4, 4) of the frames, placed in the world of the known poses.
+        frames: ascending numbers of these frames.
+        known: of the frames, with the poses that are used.
+        factor: by which placing them multiplied depth.
+        scale: of the prediction.
+    """
+    from scipy.spatial.transform import Rotation, Slerp
+
+    rows = np.flatnonzero(known.has_pose)
+    about = {"scale": factor, "rotation_deg": None, "position": None}
+    metres = Scale(value=factor, source=f"the known cameras in {known.source}", spread=None) if known.metric else None
+    if not len(rows):
+        return Tied(T_cam_world=T_cam_world, scale=metres, about=about)
+    given, placed, T = _poses(known), torch.from_numpy(T_cam_world[rows]).double(), torch.from_numpy(T_cam_world)
+    shift = camera_centres(given) - camera_centres(placed)
+    longest = float(torch.cdist(camera_centres(given), camera_centres(given)).max())
+    angle = torch.rad2deg(rotation_angle(placed[:, :3, :3], given[:, :3, :3]).quantile(0.5))
+    position = float(shift.norm(dim=-1).quantile(0.5)) / longest if longest > 0 else None
+    sim3 = replace(Sim3.identity(), s=torch.tensor(factor, dtype=torch.float64))
+    fit = CameraFit(sim3=sim3, has_scale=True, spread=None, rotation_deg=float(angle), position=position)
+    _doubt_poses(fit, known, scale)
+    # Before the first and after the last of them everything follows that one.
+    around = np.concatenate(([0], np.arange(len(rows)), [len(rows) - 1]))
+    times = [frames[0] - 1, *(frames[row] for row in rows), frames[-1] + 1]
+    turns = Slerp(times, Rotation.from_matrix((given[:, :3, :3].mT @ placed[:, :3, :3]).numpy()[around]))(frames)
+    shifts = np.stack([np.interp(frames, times, values) for values in shift.numpy()[around].T], axis=1)
+    R = T[:, :3, :3] @ torch.from_numpy(turns.as_matrix()).mT
+    moved = from_Rt(R, -(R @ (camera_centres(T) + torch.from_numpy(shifts))[..., None]).squeeze(-1))
+    moved[rows] = given
+    about |= {"rotation_deg": float(angle), "position": position}
+    return Tied(T_cam_world=moved.numpy(), scale=metres, about=about)
 
 
 def is_measurable(posed: Posed, known: KnownCameras) -> bool:

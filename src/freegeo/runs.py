@@ -14,6 +14,8 @@ from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
+import numpy as np
+
 from freegeo.adaptation.adapt import require_unchanged_images
 from freegeo.adaptation.adapter_files import WEIGHTS, read_peft
 from freegeo.adaptation.memory import plan_reconstruction, require_adaptation_fits
@@ -40,8 +42,6 @@ from freegeo.sequence.chunks import OVERLAP, OrderRule, plan_chunks
 from freegeo.sequence_job import SEQUENCE_PARTS, Plan, SequenceJob
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from freegeo.cameras.known import KnownCameras
     from freegeo.metres import ScaleSource
     from freegeo.models.api import ReconstructionModel
@@ -128,14 +128,14 @@ class SequenceWish:
                     "Continue it where there is as much memory as before, choose another folder, or replace it "
                     "(--overwrite)."
                 )
-            raise UserError(f"--chunk {size}: {fit}. Take --chunk {fitting}.")
+            raise UserError(f"chunks of {size} photos are too large: {fit}. Take smaller ones (--chunk {fitting}).")
         overlap = max(1, int(size * OVERLAP)) if self.overlap is None else int(self.overlap)
         if len(plan_chunks(count, size, overlap)) == 1:
             return None
         if not model.spec.cameras:
             raise UserError(
                 f"{model.spec.name} predicts no cameras, so that chunks of {count} photos cannot be joined. Take "
-                "another model, or --max-views."
+                "another model, or fewer photos (--max-views)."
             )
         return Plan(size=size, overlap=overlap, order=self.order, loops=self.loops)
 
@@ -242,22 +242,26 @@ def _require_adaptable(chunks: Plan, recipe: Recipe | None) -> None:
         return
     if chunks.size < SMALLEST_SCENE:
         raise UserError(
-            f"--chunk {chunks.size}: adaptation needs chunks of at least {SMALLEST_SCENE} photos. Take larger ones, or "
-            "reconstruct without adapting (--no-adapt)."
+            f"chunks of {chunks.size} photos: adaptation needs at least {SMALLEST_SCENE} in each. Take larger ones "
+            "(--chunk), or reconstruct without adapting (--no-adapt; in Python without a recipe)."
         )
     if recipe.cameras:
         raise UserError(
             f"recipe {recipe.name} learns from cameras of one chunk, and these are more photos than are predicted at "
-            "once. Take recipe scene, or --max-views."
+            "once. Take recipe scene, or fewer photos (--max-views)."
         )
 
 
 def _require_joinable(known: KnownCameras | None) -> None:
     """Raise UserError for known cameras that chunks cannot have."""
-    if known is not None and known.has_pose.any() and not known.has_pose.all():
+    if known is None or not known.has_pose.any() or known.has_pose.all():
+        return
+    centres = np.stack([-T[:3, :3].T @ T[:3, 3] for T in known.poses.values()])
+    if np.ptp(centres, axis=0).max() <= 1e-9 * np.abs(centres).max():
         raise UserError(
-            f"{known.source}: of some photos the pose is known and of others not, and these are more photos than are "
-            "predicted at once. Give the poses of all photos, or of none, or only the photos whose poses are known."
+            f"{known.source}: more photos than are predicted at once take known poses of two photos or more in "
+            f"different places, and there {'is one' if len(centres) == 1 else 'are none'}. Give poses of more "
+            "photos, or of none."
         )
 
 

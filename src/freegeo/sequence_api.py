@@ -128,8 +128,8 @@ def reconstruct_sequence(
         guard: of an adaptation, as for `freegeo.adapt`.
         seed: of everything random.
         adapter: folder of a saved adapter, instead of a recipe.
-        cameras: known cameras, as for `freegeo.reconstruct`; of more photos than are predicted at once, poses of all
-            or of none. Photos with distortion are undistorted, and copies of them written.
+        cameras: known cameras, as for `freegeo.reconstruct`; of more photos than are predicted at once, poses of some
+            take two or more in different places. Photos with distortion are undistorted, and copies of them written.
         trust_cameras: use poses without checking them by the matches between the photos.
         one_camera: as for `freegeo.reconstruct`.
         scale: as for `freegeo.reconstruct`; it holds for a piece that shows the measured places.

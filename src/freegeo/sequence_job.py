@@ -56,7 +56,7 @@ from freegeo.job import (
 from freegeo.metres import FEWEST_POSITIONS, Gps, ScaleSource, scale_to_metres
 from freegeo.models.priors import usable
 from freegeo.pipeline import capital, judge_by_photos
-from freegeo.posed import doubt_focal_length, told_in_chunks, with_one_camera
+from freegeo.posed import doubt_focal_length, told_in_chunks, with_one_camera, with_poses
 from freegeo.report.page import write_report
 from freegeo.run_folder import Part
 from freegeo.sequence.alignment import Seam
@@ -156,6 +156,10 @@ class SequenceJob(Job):
     _measured: dict[tuple[str, str], Seam | None] = field(default_factory=dict)
     matched: list[str] = field(default_factory=list)
     """Folders of the chunks, loops and bridges that have a part in the result."""
+    world: int | None = None
+    """Number of the piece that poses of some photos place in their world."""
+    odd: list[int] = field(default_factory=list)
+    """Frames whose known poses contradict the others and are not used."""
 
     def run(self) -> dict[str, Any]:
         """Write everything and return the content of reconstruction.json."""
@@ -181,8 +185,9 @@ class SequenceJob(Job):
         with self._timed("places of chunks", JOINING):
             found = assemble(
                 parts, self._seams(parts, names, seams), self._reader(names), fixed_scale=self.spec.metric,
-                placed=self._is_placed,
+                placed=self._is_placed, poses=self._partly_known.poses if self._partly_known else None,
             )  # fmt: skip
+        self._doubt_ties(found)
         load = [partial(self._reader(names), k) for k in range(len(names))]
         pieces = [[Member(chunk=parts[k], sim3=found.sim3[k], load=load[k]) for k in piece] for piece in found.pieces]
         held = self._held(found, loops, parts, len(numbers))
@@ -366,7 +371,7 @@ class SequenceJob(Job):
         values |= {
             "batch": self.batch.select(frames), "photos": [self.photos[i] for i in frames],
             "folder": self.folder.sub(f"{CHUNKS_FOLDER}/{name}"),
-            "known": None if self.known is None else self.known.select(frames),
+            "known": self._known_of(frames),
             "priors": self._priors_of(frames), "masks": None, "scale": None,
             "hooks": Hooks(stage=stage),
         }  # fmt: skip
@@ -375,6 +380,14 @@ class SequenceJob(Job):
     def _priors_of(self, frames: Sequence[int]) -> Priors | None:
         """Return what the model is told of some frames: what it can take of these, whatever is known of others."""
         return None if self.priors is None else usable(self.priors.select(frames), self.spec)[0]
+
+    def _known_of(self, frames: Sequence[int]) -> KnownCameras | None:
+        """Return what the result of a chunk has of known cameras; poses of some photos place chunks as they are."""
+        if self.known is None:
+            return None
+        known = self.known.select(list(frames))
+        known = known if self._partly_known is None else known.without_poses(range(len(frames)))
+        return known if (known.has_pose | known.has_K).any() else None
 
     def said_of_known(self) -> str | None:
         """Return what is said of known cameras that the model is told, or not told; None without any."""
@@ -511,6 +524,33 @@ class SequenceJob(Job):
         """Whether all chunks are in the frame of known cameras."""
         return self.known is not None and bool(self.known.has_pose.all())
 
+    @property
+    def _partly_known(self) -> KnownCameras | None:
+        """Known cameras that tie chunks to their world, since the poses of some photos are known; None without."""
+        return self.known if self.known is not None and self.known.has_pose.any() and not self._is_placed else None
+
+    def _doubt_ties(self, found: Assembly) -> None:
+        """Note which piece is in the world of known cameras, and say which poses are not used."""
+        self.world, self.odd, known = found.world, found.odd, self._partly_known
+        if known is None:
+            return
+        if found.odd:
+            self._warn(
+                f"{known.source}: the poses of {len(found.odd)} of {int(known.has_pose.sum())} photos contradict the "
+                f"others and what the model sees, and are not used: {some_of([known.names[i] for i in found.odd])}. "
+                "Correct them if they are wrong; if they are right, the result is wrong around these photos."
+            )
+        if found.world is None:
+            self._warn(
+                f"{known.source}: no part of the sequence that could be joined has photos with known poses in two "
+                "places, so that its position and scale are the model's. Give poses of more photos."
+            )
+        elif found.world > 0:
+            self._warn(
+                f"{known.source}: the piece of the result has no photos with known poses in two places: its position "
+                f"and scale are the model's. {_piece_folder(found.world)} has those of the known cameras."
+            )
+
     # -- the result
 
     def _told_of(
@@ -562,6 +602,7 @@ class SequenceJob(Job):
             self._warn(
                 f"The photos fall into {len(parts)} pieces that could not be joined: the result is that of "
                 f"{self._span(parts[0])}, and there are {others}."
+                + (" Known poses of two photos in each would join them." if self._partly_known else "")
             )
         if missing:
             self._warn(f"{missing} of {len(self.batch)} photos are in no chunk that could be predicted.")
@@ -584,8 +625,8 @@ class SequenceJob(Job):
             worst = max(doubtful, key=lambda seam: seam["gap"] or 0.0)
             self._warn(
                 f"Neighbouring chunks fit badly at {len(doubtful)} seams, worst of all chunks {worst['first']} and "
-                f"{worst['second']}: {worst['reason']} Surfaces may be bent or doubled there. Try another --chunk, a "
-                "larger --overlap or a larger model."
+                f"{worst['second']}: {worst['reason']} Surfaces may be bent or doubled there. Try chunks of "
+                "another size (--chunk) that share more photos (--overlap), or a larger model."
             )
 
     def _span(self, part: Mapping[str, int]) -> str:
@@ -602,7 +643,7 @@ class SequenceJob(Job):
         folder, photos = self.folder.path / _piece_folder(number), [self.photos[i] for i in frames]
         label = "" if number == 0 else f"piece {number + 1}: "
         self.hooks.stage(f"{label}joining {len(members)} chunks")
-        result, about = self._joined(folder, members, frames, photos, label)
+        result, about = self._joined(folder, members, frames, photos, label, is_tied=number == self.world)
         told["pieces"][number]["together"] = about.pop("together")
         if not (told["pieces"][number]["together"] or {}).get("accepted"):
             self._doubt_seams(number, told)
@@ -629,6 +670,8 @@ class SequenceJob(Job):
         frames: Sequence[int],
         photos: Sequence[PhotoLike],
         label: str,
+        *,
+        is_tied: bool,
     ) -> tuple[Reconstruction, dict[str, Any]]:
         """Write the prediction of a piece, one frame after the other, and return it as it is on disk, with facts."""
         joined = Joined(members, frames)
@@ -636,6 +679,8 @@ class SequenceJob(Job):
         T_cam_world, K = joined.T_cam_world, joined.K
         about: dict[str, Any] = {"known_cameras": self._about_known(), "one_camera": None, "together": None}
         factors = np.ones(len(frames))
+        if self._partly_known is not None:
+            T_cam_world, scale, about["known_cameras"] = self._tied(joined, members, frames, scale, is_tied=is_tied)
 
         def save() -> Reconstruction:
             save_streamed(
@@ -685,6 +730,24 @@ class SequenceJob(Job):
         if names:
             self._warn(f"Too few matches for {some_of(names)}: they follow their neighbours and keep the median scale.")
 
+    def _tied(
+        self, joined: Joined, members: Sequence[Member], frames: Sequence[int], scale: Scale | None, *, is_tied: bool
+    ) -> tuple[np.ndarray, Scale | None, dict[str, Any]]:
+        """Give a piece in the world of known poses these: cameras, scale, and what is said of them."""
+        known, about = self._partly_known, self._about_known()
+        assert known is not None and about is not None
+        used = known.select(list(frames)).without_poses([row for row, i in enumerate(frames) if i in self.odd])
+        posed = {i for i, has_pose in zip(frames, used.has_pose, strict=True) if is_tied and has_pose}
+        about |= {
+            "poses": len(posed), "given": int(known.has_pose.sum()), "odd": [known.names[i] for i in self.odd],
+            "chunks": len(members), "untied": sum(posed.isdisjoint(member.chunk.frames) for member in members),
+        }  # fmt: skip
+        if not is_tied:
+            return joined.T_cam_world, scale, about
+        factor = float(np.median([float(member.sim3.s) for member in members]))
+        found = with_poses(joined.T_cam_world, frames, used, factor, scale)
+        return found.T_cam_world, found.scale, about | dict(found.about)
+
     def _metres(
         self, folder: Path, result: Reconstruction, frames: Sequence[int], photos: Sequence[PhotoLike]
     ) -> Scale | None:
@@ -710,13 +773,14 @@ class SequenceJob(Job):
         told = [
             value["known_cameras"] for value in noted.values() if isinstance(value, dict) and value.get("known_cameras")
         ]
-        if self.known is None or not told:
+        if self.known is None or not (told or self._partly_known):
             return None
         medians = _medians([{name: one[name] for name in _KNOWN_MEDIANS} for one in told])
         measured = [one["measured"] for one in told if one.get("measured")]
         sums = {name: sum(one[name] for one in measured) for name in ("points", "views")}
         return {
-            **told[0], **(medians or {}), "poses": int(self.known.has_pose.sum()),
+            "source": self.known.source, "metric": self.known.metric,
+            **(medians or dict.fromkeys(_KNOWN_MEDIANS)), "poses": int(self.known.has_pose.sum()),
             "intrinsics": int(self.known.has_K.sum()), "model": self.said_of_known(),
             "measured": {**(_medians(measured) or {}), **sums} if measured else None,
         }  # fmt: skip

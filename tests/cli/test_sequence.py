@@ -354,6 +354,41 @@ def test_chunks_with_known_cameras_stay_where_they_are(freegeo, walk, tiny, tmp_
 
 
 @pytest.mark.slow
+def test_known_poses_of_some_photos_put_chunks_into_their_world(freegeo, walk, tiny, tmp_path, oracle, truth):
+    """One of them is wrong, and no pair of them can be checked by matches."""
+    cameras = [replace(camera, K=None) for camera in cameras_of(truth)]
+    given = {1: cameras[1], 5: cameras[5], 7: cameras[12], 9: cameras[9], 12: cameras[12]}
+    known = tuple(given.get(frame, KnownCamera()) for frame in range(FRAMES))
+    file = tmp_path / "cameras.json"
+    write(KnownCameras(names=truth.names, cameras=known, source="x", metric=True), file)
+    out = tmp_path / "out"
+    outcome = freegeo("reconstruct", walk, "-o", out, *tiny, *CHUNKS, "--cameras", file, "--trust-cameras")
+    assert outcome.code == 0, outcome.err
+    result, about = open_reconstruction(out), told(out)
+    np.testing.assert_allclose(result.cameras()[0], np.stack([one.T_cam_world for one in cameras]), atol=2e-3)
+    np.testing.assert_allclose(result.cameras()[0][[1, 12]], [cameras[k].T_cam_world for k in (1, 12)], atol=1e-12)
+    np.testing.assert_allclose(result.depth_z, truth.depth_z, rtol=2e-3)
+    assert result.scale is not None and result.scale.source == f"the known cameras in {file}"
+    (said,) = [said for said in about["warnings"] if "contradict the others and what the model sees" in said]
+    assert "1 of 5 photos" in said and "07.png" in said
+    assert {name: about["known_cameras"][name] for name in ("poses", "given", "odd", "chunks", "untied")} == {
+        "poses": 4, "given": 5, "odd": ["07.png"], "chunks": COUNT, "untied": 0,
+    }  # fmt: skip
+    assert about["known_cameras"]["rotation_deg"] < 0.1 and about["known_cameras"]["position"] < 1e-3
+    said = "5 given, 1 of them not used, 0 of 4 chunks without one; placed by them, the model"
+    assert said in outcome.out and said in (out / "report.html").read_text()
+
+
+def test_one_known_pose_of_a_sequence_is_refused(freegeo, walk, tiny, tmp_path, oracle, truth):
+    cameras = (cameras_of(truth)[0], *[KnownCamera()] * (FRAMES - 1))
+    file = tmp_path / "cameras.json"
+    write(KnownCameras(names=truth.names, cameras=cameras, source="x"), file)
+    outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS, "--cameras", file)
+    assert outcome.code == 2 and not oracle.asked
+    assert "known poses of two photos or more in different places, and there is one" in outcome.sentence()
+
+
+@pytest.mark.slow
 def test_a_distance_in_one_piece_leaves_the_others_up_to_scale(freegeo, walk, tiny, tmp_path, oracle):
     oracle.change = lambda number, result: unlike(result) if number == 2 or number >= COUNT else result
     distance = "00.png:10,10 01.png:50,40 = 2"
@@ -383,8 +418,8 @@ def test_photos_in_an_order_of_their_own_are_described_once(freegeo, walk, tiny,
     [
         (["--chunk", "many"], "--chunk is auto or a number of photos"),
         (["--chunk", "1"], "--chunk is auto or a number of photos"),
-        (["--chunk", "6", "--overlap", "6"], "--overlap must be from 1 to 5"),
-        (["--chunk", "6", "--overlap", "0"], "--overlap must be from 1 to 5"),
+        (["--chunk", "6", "--overlap", "6"], "share from 1 to 5 of them (--overlap), got 6"),
+        (["--chunk", "6", "--overlap", "0"], "share from 1 to 5 of them (--overlap), got 0"),
     ],
 )
 def test_chunks_that_cannot_be_are_refused(freegeo, walk, tiny, tmp_path, options, words):
@@ -397,7 +432,7 @@ def test_chunks_that_cannot_be_are_refused(freegeo, walk, tiny, tmp_path, option
 def test_chunks_that_are_too_small_to_adapt_to_are_refused_at_once(freegeo, walk, tiny, tmp_path, oracle):
     outcome = freegeo("run", walk, "-o", tmp_path / "out", *tiny, "--chunk", 2)
     assert outcome.code == 2
-    assert "--chunk 2: adaptation needs chunks of at least 3 photos" in outcome.sentence()
+    assert "chunks of 2 photos: adaptation needs at least 3 in each" in outcome.sentence()
     assert not oracle.asked
 
 

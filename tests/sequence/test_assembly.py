@@ -174,3 +174,65 @@ def test_loops_that_contradict_each_other_leave_those_of_another_part_alone(whol
     for ties, reason in ((wrong, CONTRADICTED), (right, None)):
         assert {joint.reason for joint in found.joints if ties & {joint.first, joint.second}} == {reason}
     assert [len(frames) for frames in found.frames] == [FRAMES, FRAMES]
+
+
+def poses_of(whole: Reconstruction, *frames: int, wrong: int | None = None) -> dict[int, np.ndarray]:
+    """The true poses of some frames; the wrong one is turned by 20 degrees and moved."""
+    T = torch.from_numpy(whole.cameras()[0]).double()
+    off = Sim3.exp(torch.tensor([0, 0.35, 0, 0.5, 0, 0, 0], dtype=torch.float64))
+    return {k: (off.apply_to_cameras(T[k][None])[0] if k == wrong else T[k]).numpy() for k in frames}
+
+
+def assert_true(found, parts: list[Reconstruction], chunks: list[Chunk], whole: Reconstruction, numbers) -> None:
+    """Chunks are in the frame and scale of the truth."""
+    true = camera_centres(torch.from_numpy(whole.cameras()[0]).double())
+    for number in numbers:
+        T = found.sim3[number].apply_to_cameras(torch.from_numpy(parts[number].cameras()[0]).double())
+        torch.testing.assert_close(camera_centres(T), true[list(chunks[number].frames)], atol=1e-3, rtol=0)
+        assert float(found.sim3[number].s * similarity(number).s) == pytest.approx(1, abs=1e-3)
+
+
+@pytest.mark.parametrize("frames", [(0, 13), (2, 3, 9)])
+def test_known_poses_of_some_frames_give_frame_and_scale(whole, frames):
+    chunks = plan_chunks(FRAMES, 6, 2)
+    found, parts = put_together(whole, chunks, poses=poses_of(whole, *frames))
+    assert (found.world, found.odd) == (0, [])
+    assert_true(found, parts, chunks, whole, range(len(chunks)))
+
+
+def test_a_wrong_pose_among_known_ones_is_named_and_bends_nothing(whole):
+    chunks = plan_chunks(FRAMES, 6, 2)
+    found, parts = put_together(whole, chunks, poses=poses_of(whole, 1, 4, 7, 12, wrong=7))
+    assert found.odd == [7]
+    assert_true(found, parts, chunks, whole, range(len(chunks)))
+
+
+def test_pieces_with_known_poses_become_one(whole):
+    chunks = plan_chunks(FRAMES, 6, 2)
+    found, parts = put_together(whole, chunks, 1, poses=poses_of(whole, 0, 1, 11, 13))
+    assert (found.world, found.odd, found.pieces) == (0, [], [[0, 2], [1]])
+    assert_true(found, parts, chunks, whole, (0, 2))
+    found, _ = put_together(whole, chunks, 1, poses=poses_of(whole, 0, 1, 13))
+    assert (found.world, found.pieces) == (0, [[0], [1], [2]])
+
+
+@pytest.mark.slow
+def test_known_poses_take_drift_away(whole):
+    """Every seam turns the next chunk by .1 radians too far and makes it a tenth too large."""
+    chunks = plan_chunks(FRAMES, 6, 2)
+    parts = [part_of(whole, chunk, similarity(number)) for number, chunk in enumerate(chunks)]
+    seams = {
+        pair: replace(seam, sim3=seam.sim3 @ Sim3.exp(torch.tensor([0, 0.1, 0, 0, 0, 0, 0.1], dtype=torch.float64)))
+        for pair, seam in seams_between(chunks, parts.__getitem__).items()
+    }
+    true = camera_centres(torch.from_numpy(whole.cameras()[0]).double())
+
+    def error(*frames: int) -> float:
+        found = assemble(chunks, seams, parts.__getitem__, poses=poses_of(whole, *frames))
+        placed = [
+            camera_centres(sim3.apply_to_cameras(torch.from_numpy(part.cameras()[0]).double())) - true[list(c.frames)]
+            for c, part, sim3 in zip(chunks, parts, found.sim3, strict=True)
+        ]
+        return float(torch.cat(placed).norm(dim=-1).max())
+
+    assert error(0, 1, 6, 7, 12, 13) < 0.3 * error(0, 1)

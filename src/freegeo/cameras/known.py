@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -67,3 +68,13 @@ class KnownCameras:
     def select(self, views: list[int]) -> Self:
         """Return the chosen photos, in the order given."""
         return replace(self, names=tuple(self.names[i] for i in views), cameras=tuple(self.cameras[i] for i in views))
+
+    @property
+    def poses(self) -> dict[int, np.ndarray]:
+        """Return `T_cam_world` (4, 4) of the photos whose pose is known."""
+        return {i: one.T_cam_world for i, one in enumerate(self.cameras) if one.T_cam_world is not None}
+
+    def without_poses(self, views: Collection[int]) -> Self:
+        """Return the same without the poses of some photos."""
+        cameras = (replace(one, T_cam_world=None) if i in views else one for i, one in enumerate(self.cameras))
+        return replace(self, cameras=tuple(cameras))

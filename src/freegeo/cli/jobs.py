@@ -199,7 +199,7 @@ def describe(summary: dict[str, Any], folder: Path) -> None:
 
 def say_known(summary: dict[str, Any]) -> None:
     """Print what known cameras made of the prediction."""
-    from freegeo.report.answer import rescaled
+    from freegeo.report.answer import rescaled, ties
 
     about = summary["known_cameras"]
     parts = [f"poses of {about['poses']} and intrinsics of {about['intrinsics']} photos as given"]
@@ -211,7 +211,9 @@ def say_known(summary: dict[str, Any]) -> None:
         factor = (metres or 1) * (1 if measured is None else measured["factor"])
         by = "" if measured is None else f" (by {measured['points']:,} points that matches measure with these cameras)"
         parts.append(f"depth times {about['scale'] * factor:.4g}{by}")
-    if about["rotation_deg"] is not None:
+    if "untied" in about:
+        parts.append(f"poses {ties(about)}")
+    elif about["rotation_deg"] is not None:
         far = "" if about["position"] is None else f", {100 * about['position']:.2g} % of the longest distance"
         parts.append(f"predicted cameras differed by {about['rotation_deg']:.2g} degrees{far} in the median")
     console.say(f"cameras of {about['source']}: {'; '.join(parts)}")

@@ -70,6 +70,17 @@ def rescaled(summary: Mapping[str, Any]) -> float | None:
     return None if scale["source"] in own else float(scale["value"])
 
 
+def ties(known: Mapping[str, Any]) -> str:
+    """Return what the known poses of some photos made of a piece of a sequence, for people."""
+    untied = f"{known['untied']} of {known['chunks']} chunks without one"
+    said = f"{known['given']} given, {len(known['odd'])} of them not used, {untied}"
+    if known["rotation_deg"] is None:
+        return f"{said}; the piece is not in their world"
+    far = "" if known["position"] is None else f" and {100 * known['position']:.2g} % of the longest distance"
+    angle = f"{known['rotation_deg']:.2g} degrees"
+    return f"{said}; placed by them, the model's cameras differ from them by {angle}{far} in the median"
+
+
 def _adaptation(summary: Mapping[str, Any]) -> Iterator[Part]:
     if not summary.get("recipe"):
         return

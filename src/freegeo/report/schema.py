@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Required, TypedDict
+from typing import Any, NotRequired, Required, TypedDict
 
 from freegeo.files import read_json
 
@@ -58,6 +58,13 @@ class Known(TypedDict):
 
     poses: int
     intrinsics: int
+    given: NotRequired[int]
+    """Of a sequence: known poses of all its photos. The next ones are of the same kind, and of this piece."""
+    odd: NotRequired[list[str]]
+    chunks: NotRequired[int]
+    untied: NotRequired[int]
+    rotation_deg: NotRequired[float | None]
+    position: NotRequired[float | None]
 
 
 class RecipeFacts(TypedDict):

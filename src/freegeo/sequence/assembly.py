@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
+import torch
 
 from freegeo.geometry.sim3 import Sim3
 from freegeo.sequence.alignment import INLIER, Depths, Seam, align, gap
 from freegeo.sequence.chunks import Chunk, common_rows
-from freegeo.sequence.graph import Edge, place
+from freegeo.sequence.graph import Edge, Placed, Sight, place, place_in_world
 
 Kind = Literal["neighbours", "bridge", "loop"]
 """What a seam joins: chunks that follow each other, others that share frames, or a loop to the sequence."""
@@ -69,6 +70,10 @@ class Assembly:
     frames: list[list[int]]
     """Of each piece, ascending. A frame of several pieces belongs to the first of them, and a piece without a frame of
     its own is none."""
+    world: int | None = None
+    """Number of the piece that is in the world of known cameras."""
+    odd: list[int] = field(default_factory=list)
+    """Frames whose known poses contradict the others, and have no part in where the chunks are."""
 
 
 def seams_between(
@@ -106,8 +111,9 @@ def broken(chunks: Sequence[Chunk], seams: Seams) -> list[tuple[int, int]]:
 
 
 def assemble(
-    chunks: Sequence[Chunk], seams: Seams, load: Load, *, fixed_scale: bool = False, placed: bool = False
-) -> Assembly:
+    chunks: Sequence[Chunk], seams: Seams, load: Load, *, fixed_scale: bool = False, placed: bool = False,
+    poses: Mapping[int, np.ndarray] | None = None,
+) -> Assembly:  # fmt: skip
     """Place chunks so that they fit at their seams.
 
     Args:
@@ -116,6 +122,7 @@ def assemble(
         load: reads the prediction of a chunk by its number here.
         fixed_scale: as for `seams_between`.
         placed: the chunks are in one frame already, as with known cameras: nothing is moved.
+        poses: known `T_cam_world` (4, 4) of some frames; a piece that has them in two places or more is in their world.
     """
     read = lru_cache(maxsize=_OPEN)(load)
 
@@ -132,13 +139,19 @@ def assemble(
         return Assembly(joints=joints, sim3=same, pieces=pieces, frames=_own_frames(chunks, pieces))
     good = [pair for pair, seam in seams.items() if seam.reason is None]
     edges = [Edge.of(a, b, seams[a, b], robust=_kind(chunks, a, b) == "loop") for a, b in good]
-    found = place(len(chunks), edges, fixed_scale=fixed_scale)
+    sights = _sights(chunks, read, poses) if poses else []
+
+    def places(edges: Sequence[Edge]) -> Placed:
+        found = place(len(chunks), edges, fixed_scale=fixed_scale)
+        return place_in_world(found, edges, sights) if sights else found
+
+    found = places(edges)
     loops = {pair for pair in good if _kind(chunks, *pair) == "loop"}
     # Which one is wrong cannot be told: of places that look alike several may agree, against a true loop.
     contradicted = loops & _connected(len(chunks), good, [trust == 0 for trust in found.trust])
     if contradicted:
         edges = [edge for pair, edge in zip(good, edges, strict=True) if pair not in contradicted]
-        found = place(len(chunks), edges, fixed_scale=fixed_scale)
+        found = places(edges)
     of = {number: k for k, piece in enumerate(found.pieces) for number in piece}
     joints = []
     for (a, b), seam in seams.items():
@@ -150,10 +163,30 @@ def assemble(
     pieces = [[number for number in piece if chunks[number].tie is None] for piece in found.pieces]
     pieces.sort(key=lambda piece: (-len({frame for number in piece for frame in chunks[number].frames}), piece))
     frames = _own_frames(chunks, pieces)
+    pieces, frames = [piece for piece, own in zip(pieces, frames, strict=True) if own], [own for own in frames if own]
+    seen = [(one.frame, far) for one, far in zip(sights, found.doubted, strict=True) if one.chunk in found.world]
     return Assembly(
-        joints=joints, sim3=found.sim3, pieces=[piece for piece, own in zip(pieces, frames, strict=True) if own],
-        frames=[own for own in frames if own],
+        joints=joints, sim3=found.sim3, pieces=pieces, frames=frames,
+        world=next((k for k, piece in enumerate(pieces) if piece[0] in found.world), None),
+        odd=sorted({frame for frame, _ in seen} - {frame for frame, far in seen if not far}),
     )  # fmt: skip
+
+
+def _sights(chunks: Sequence[Chunk], read: Load, poses: Mapping[int, np.ndarray]) -> list[Sight]:
+    """Return where the chunks of the sequence see the photos with known poses."""
+    found = []
+    for number, chunk in enumerate(chunks):
+        own = [(row, frame) for row, frame in enumerate(chunk.frames) if frame in poses]
+        if chunk.tie is not None or not own:
+            continue
+        part = read(number)
+        T, usable = part.cameras()[0], part.valid_pixels()
+        for row, frame in own:
+            if usable[row].any():
+                predicted, given = (torch.from_numpy(np.asarray(one, np.float64)) for one in (T[row], poses[frame]))
+                depth = float(np.median(part.depth_z[row][usable[row]]))
+                found.append(Sight(chunk=number, frame=frame, predicted=predicted, known=given, depth=depth))
+    return found
 
 
 def _connected(count: int, pairs: Sequence[tuple[int, int]], chosen: Sequence[bool]) -> set[tuple[int, int]]:

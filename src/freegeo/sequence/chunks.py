@@ -39,10 +39,10 @@ def plan_chunks(count: int, size: int, overlap: int) -> list[Chunk]:
         UserError: a size below 2, or an overlap that is not from 1 to size - 1.
     """
     if size < 2:
-        raise UserError(f"--chunk must be at least 2 frames, got {size}.")
+        raise UserError(f"a chunk has at least 2 photos (--chunk), got {size}.")
     if not 1 <= overlap < size:
         raise UserError(
-            f"--overlap must be from 1 to {size - 1}, less than the {size} frames of a chunk, got {overlap}."
+            f"neighbouring chunks of {size} photos share from 1 to {size - 1} of them (--overlap), got {overlap}."
         )
     step = size - overlap
     chunks = max(1, -(-(count - overlap) // step))

@@ -5,25 +5,32 @@ docs/sequences.md, "Placing chunks", says what is minimised.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from freegeo.errors import FreeGeoError
-from freegeo.geometry.sim3 import Sim3
+from freegeo.geometry.se3 import camera_centres
+from freegeo.geometry.sim3 import SHORT_PAIR, DegenerateAlignmentError, Sim3, fit_cameras
 from freegeo.sequence.alignment import Seam
 
-__all__ = ["LEAST_TRUST", "Edge", "Placed", "place"]
+__all__ = ["LEAST_TRUST", "Edge", "Placed", "Sight", "place", "place_in_world"]
 
 KERNEL = 0.1
 """Difference of a robust edge from the result that halves its weight."""
 LEAST_TRUST = 0.2
 """A robust edge that keeps less of its weight is left out, for even a small pull bends a long chain."""
-_WIDE_KERNEL = 1.0
+_WIDER = 10.0
 _MOST_STEPS = 30
+_MEDIANS = 2.0
+"""Differences of known poses that halve their weight, in medians of all, where that is more than `KERNEL`."""
+_ROUNDS, _SETTLED = 5, 0.9
+_MOST_PAIRS = 300
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +49,10 @@ class Edge:
     """Where (3,) it was measured, in the frame of `second`: disagreements are counted there."""
     size: float
     """Length in units of `second` that a shift is relative to, such as the median depth."""
+    has_scale: bool = True
+    """Whether a scale was measured; one known pose has none."""
+    kernel: float = KERNEL
+    """Difference from the result that halves the weight of a robust edge."""
 
     @classmethod
     def of(cls, first: int, second: int, seam: Seam, *, robust: bool = False) -> Edge:
@@ -70,6 +81,35 @@ class Placed:
     shift by `Edge.size` and a factor of e count alike. NaN for an edge between two pieces."""
     trust: np.ndarray
     """(edges,) weight, 0 to 1, that a robust edge kept, 0 where it was left out; 1 for the others."""
+    world: list[int] = field(default_factory=list)
+    """The chunks that are in the world of known cameras, which are one of the pieces."""
+    doubted: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    """(sights,) whether a known pose of a chunk in the world is too far from the result, and has no part in it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sight:
+    """A photo of a chunk whose pose in the world of known cameras is known."""
+
+    chunk: int
+    frame: int
+    """Of the photo."""
+    predicted: Tensor
+    """`T_cam_world` (4, 4) float64 in the frame of the chunk."""
+    known: Tensor
+    """`T_cam_world` (4, 4) float64 in the world of the known cameras."""
+    depth: float
+    """Median depth of the photo in units of the chunk."""
+
+    def edge(self, scale: Tensor, kernel: float) -> Edge:
+        """Return the edge from the world, which is 0, to the chunk, whose units are `scale` ones of the world."""
+        R = self.known[:3, :3].mT @ self.predicted[:3, :3]
+        centre = camera_centres(self.predicted)
+        sim3 = Sim3(s=scale, R=R, t=camera_centres(self.known) - scale * (R @ centre))
+        return Edge(
+            first=0, second=self.chunk, sim3=sim3, weight=1.0, robust=True, centre=centre, size=self.depth,
+            has_scale=False, kernel=kernel,
+        )  # fmt: skip
 
 
 def place(count: int, edges: Sequence[Edge], *, fixed_scale: bool = False) -> Placed:
@@ -102,17 +142,124 @@ def place(count: int, edges: Sequence[Edge], *, fixed_scale: bool = False) -> Pl
     if not edges:
         return Placed(sim3=placed, pieces=pieces, residuals=np.zeros(0), trust=np.zeros(0))
     graph = _Graph.of(edges)
-    lengths = torch.linalg.vector_norm(graph.differences(*graph.ends(Sim3.stack(placed))), dim=-1).numpy()
-    trust = np.where(graph.robust.numpy(), 1 / (1 + graph.weight.numpy() * (lengths / KERNEL) ** 2), 1.0)
+    lengths = graph.lengths(placed)
+    trust = graph.trust(lengths)
     kept = trust >= LEAST_TRUST
     if not kept.all():
         rest = place(count, [edge for edge, keep in zip(edges, kept, strict=True) if keep], fixed_scale=fixed_scale)
         piece_of = {chunk: number for number, piece in enumerate(rest.pieces) for chunk in piece}
         together = np.array([piece_of[edge.first] == piece_of[edge.second] for edge in edges])
-        lengths = torch.linalg.vector_norm(graph.differences(*graph.ends(Sim3.stack(rest.sim3))), dim=-1).numpy()
+        lengths = graph.lengths(rest.sim3)
         trust[kept], trust[~kept] = rest.trust, 0.0
         return replace(rest, residuals=np.where(together, lengths, np.nan), trust=trust)
     return Placed(sim3=placed, pieces=pieces, residuals=lengths, trust=trust)
+
+
+def place_in_world(placed: Placed, edges: Sequence[Edge], sights: Sequence[Sight]) -> Placed:
+    """Bring chunks into the world of the cameras of some photos, which stay where they are known to be.
+
+    A piece with known poses in two places or more is brought there as it is, and then each pose is a robust edge to the
+    world, and its seams give way. Lengths are those of the known cameras. Such pieces are one, others stay as they are.
+
+    Args:
+        placed: by `place` of the same edges.
+        edges: the seams between the chunks.
+        sights: photos with known poses; one that is in two chunks is two of them.
+    """
+    sim3, world, doubted = list(placed.sim3), [], np.zeros(len(sights), bool)
+    trust, residuals = placed.trust.copy(), placed.residuals.copy()
+    for piece in placed.pieces:
+        seams = [k for k, edge in enumerate(edges) if edge.first in piece and trust[k] > 0]
+        own = _renumbered([edges[k] for k in seams], [-1, *piece])
+        here = [k for k, sight in enumerate(sights) if sight.chunk in piece]
+        seen = [replace(sights[k], chunk=1 + piece.index(sights[k].chunk)) for k in here]
+        found = _piece_in_world([sim3[chunk] for chunk in piece], own, seen)
+        if found is None:
+            continue
+        world += piece
+        moved, doubted[here] = found
+        for chunk, place in zip(piece, moved[1:], strict=True):
+            sim3[chunk] = place
+        if own:
+            graph = _Graph.of(own)
+            residuals[seams] = graph.lengths(moved)
+            after = graph.trust(residuals[seams])
+            trust[seams] = np.where(after >= LEAST_TRUST, after, 0.0)
+    pieces = [*(piece for piece in placed.pieces if piece[0] not in world), *([sorted(world)] if world else [])]
+    return Placed(
+        sim3=sim3, pieces=sorted(pieces), residuals=residuals, trust=trust, world=sorted(world), doubted=doubted
+    )  # fmt: skip
+
+
+def _piece_in_world(
+    placed: Sequence[Sim3], seams: Sequence[Edge], sights: Sequence[Sight], *, all_believed: bool = False
+) -> tuple[list[Sim3], np.ndarray] | None:
+    """Place the chunks of one piece by its seams and known poses; chunks count from 1, and 0 is the world.
+
+    The kernel of the poses follows their own median: how far a model's cameras are from the truth is not known.
+
+    Returns:
+        The world and the chunks, and for each sight whether it is left out; None without poses in two places.
+    """
+    fit = _fit_sights(placed, sights)
+    if fit is None:
+        return None
+    # Of two poses that contradict each other none is known to be the wrong one.
+    all_believed = all_believed or len({sight.frame for sight in sights}) == 2
+    moved, kernel = [Sim3.identity(), *(fit @ sim3 for sim3 in placed)], math.inf
+
+    def ties() -> list[Edge]:
+        found = [sight.edge(moved[sight.chunk].s, kernel) for sight in sights]
+        return [replace(tie, robust=False) for tie in found] if all_believed else found
+
+    # The first round starts from where the seams put the chunks, and drift makes its kernel too wide.
+    for _ in range(_ROUNDS):
+        before, lengths = kernel, _Graph.of(ties()).lengths(moved)
+        kernel = min(kernel, max(KERNEL, _MEDIANS * float(np.median(lengths))))
+        if kernel > _SETTLED * before:
+            break
+        moved = _refined(moved, [*seams, *ties()], fixed_scale=False)
+    tying = _Graph.of(ties())
+    doubted = tying.trust(tying.lengths(moved)) < LEAST_TRUST
+    if doubted.any():
+        if _fit_sights(moved[1:], [sight for sight, out in zip(sights, doubted, strict=True) if not out]) is None:
+            return _piece_in_world(placed, seams, sights, all_believed=True)
+        believed = [tie for tie, out in zip(ties(), doubted, strict=True) if not out]
+        moved = _refined(moved, [*seams, *believed], fixed_scale=False)
+    return moved, doubted
+
+
+def _fit_sights(placed: Sequence[Sim3], sights: Sequence[Sight]) -> Sim3 | None:
+    """Bring a piece to the known poses of its photos by those two that leave the others nearest, in the median.
+
+    The first of the chunks has number 1. None where the poses are not in two places, or the chunks have all of these
+    photos in one.
+    """
+    if len(sights) < 2:
+        return None
+    seen = [placed[sight.chunk - 1] for sight in sights]
+    predicted = torch.stack(
+        [sim3.apply_to_cameras(one.predicted[None])[0] for sim3, one in zip(seen, sights, strict=True)]
+    )
+    known = torch.stack([one.known for one in sights])
+    pairs = np.array(list(combinations(range(len(sights)), 2)))
+    if len(pairs) > _MOST_PAIRS:
+        pairs = np.random.default_rng(0).permutation(pairs)[:_MOST_PAIRS]
+    apart = torch.cdist(camera_centres(known), camera_centres(known))
+    best, least = None, math.inf
+    for pair in pairs:
+        if float(apart[tuple(pair)]) <= SHORT_PAIR * float(apart.max()):
+            continue
+        try:
+            fit = fit_cameras(predicted[pair], known[pair])
+        except DegenerateAlignmentError:
+            continue
+        moved = [fit.sim3 @ sim3 for sim3 in placed]
+        ties = [one.edge(moved[one.chunk - 1].s, KERNEL) for one in sights]
+        median = float(np.median(_Graph.of(ties).lengths([Sim3.identity(), *moved])))
+        if median < least:
+            best, least = fit.sim3, median
+    return best
 
 
 def _order(edge: Edge) -> tuple[bool, float, int, int]:
@@ -160,6 +307,9 @@ class _Graph:
     """From coordinates about the place of measurement, of its size, to the frame of the second chunk."""
     weight: Tensor
     robust: Tensor
+    kernel: Tensor
+    counted: Tensor
+    """(E, 7): 1 for what was measured, 0 for a scale that was not."""
 
     @classmethod
     def of(cls, edges: Sequence[Edge]) -> _Graph:
@@ -175,6 +325,8 @@ class _Graph:
             ),
             weight=torch.tensor([edge.weight for edge in edges], dtype=torch.float64),
             robust=torch.tensor([edge.robust for edge in edges]),
+            kernel=torch.tensor([edge.kernel for edge in edges], dtype=torch.float64),
+            counted=torch.tensor([[1.0] * 6 + [float(edge.has_scale)] for edge in edges], dtype=torch.float64),
         )
 
     def ends(self, placed: Sim3) -> tuple[Sim3, Sim3]:
@@ -183,11 +335,25 @@ class _Graph:
 
     def differences(self, first: Sim3, second: Sim3) -> Tensor:
         """Logarithms (E, 7) of what each edge lacks to the places of its chunks, about its place of measurement."""
-        return (self.local.inverse() @ self.measured.inverse() @ first.inverse() @ second @ self.local).log()
+        lacking = (self.local.inverse() @ self.measured.inverse() @ first.inverse() @ second @ self.local).log()
+        return self.counted * lacking
 
-    def errors(self, first: Sim3, second: Sim3, kernel: float) -> Tensor:
-        """Weighted differences (E, 7), of robust edges so much smaller that their square is the Cauchy loss."""
+    def lengths(self, placed: Sequence[Sim3]) -> np.ndarray:
+        """Lengths (E,) of the differences."""
+        return torch.linalg.vector_norm(self.differences(*self.ends(Sim3.stack(placed))), dim=-1).numpy()
+
+    def trust(self, lengths: np.ndarray) -> np.ndarray:
+        """Weights (E,), 0 to 1, that robust edges keep with such differences; 1 for the others."""
+        square = self.weight.numpy() * (lengths / self.kernel.numpy()) ** 2
+        return np.where(self.robust.numpy(), 1 / (1 + square), 1.0)
+
+    def errors(self, first: Sim3, second: Sim3, wider: float) -> Tensor:
+        """Weighted differences (E, 7), of robust edges so much smaller that their square is the Cauchy loss.
+
+        Kernels are `wider` than those of the edges by that factor.
+        """
         weighted = self.weight.sqrt()[:, None] * self.differences(first, second)
+        kernel = wider * self.kernel[:, None]
         square = weighted.square().sum(-1, keepdim=True).clamp(min=1e-300) / kernel**2
         return torch.where(self.robust[:, None], (square.log1p() / square).sqrt() * weighted, weighted)
 
@@ -212,16 +378,16 @@ def _refined(start: Sequence[Sim3], edges: Sequence[Edge], *, fixed_scale: bool)
         steps[1:, :free] = torch.from_numpy(x).reshape(-1, free)
         return steps
 
-    def errors_after(steps: Tensor, kernel: float) -> Tensor:
+    def errors_after(steps: Tensor, wider: float) -> Tensor:
         first, second = (forth[chunks] @ Sim3.exp(own) @ back[chunks] for chunks, own in zip(ends, steps, strict=True))
-        return graph.errors(first, second, kernel)
+        return graph.errors(first, second, wider)
 
-    def errors(x: np.ndarray, kernel: float) -> np.ndarray:
-        return errors_after(steps_of(x)[ends], kernel).flatten().numpy()
+    def errors(x: np.ndarray, wider: float) -> np.ndarray:
+        return errors_after(steps_of(x)[ends], wider).flatten().numpy()
 
-    def jacobian(x: np.ndarray, kernel: float) -> csr_array:
+    def jacobian(x: np.ndarray, wider: float) -> csr_array:
         steps = steps_of(x)[ends].requires_grad_()
-        columns = errors_after(steps, kernel).sum(0)  # each edge has steps of its own, so the sum mixes nothing
+        columns = errors_after(steps, wider).sum(0)  # each edge has steps of its own, so the sum mixes nothing
         slopes = torch.stack([torch.autograd.grad(one, steps, retain_graph=True)[0] for one in columns])
         error, end, edge, step = (slopes != 0).nonzero(as_tuple=True)
         chunk = ends[end, edge]
@@ -230,19 +396,19 @@ def _refined(start: Sequence[Sim3], edges: Sequence[Edge], *, fixed_scale: bool)
         places = ((edge * 7 + error)[used].numpy(), ((chunk - 1) * free + step)[used].numpy())
         return csr_array((entries, places), shape=(7 * len(edges), x.size))
 
-    def minimum(x: np.ndarray, kernel: float) -> tuple[float, np.ndarray]:
+    def minimum(x: np.ndarray, wider: float = 1.0) -> tuple[float, np.ndarray]:
         # The inner solver must be exact: with its default tolerance a long chain takes hundreds of steps.
         exact = {"regularize": False, "atol": 1e-12, "btol": 1e-12, "maxiter": 20 * x.size}
         found = least_squares(
-            errors, x, jac=jacobian, args=(kernel,), ftol=1e-9, xtol=1e-9, gtol=1e-12,
+            errors, x, jac=jacobian, args=(wider,), ftol=1e-9, xtol=1e-9, gtol=1e-12,
             max_nfev=_MOST_STEPS, tr_options=exact,
         )  # fmt: skip
         return float(found.cost), found.x
 
     chained = np.zeros((len(start) - 1) * free)
-    cost, best = minimum(chained, KERNEL)
+    cost, best = minimum(chained)
     if bool(graph.robust.any()):
-        other_cost, other = minimum(minimum(chained, _WIDE_KERNEL)[1], KERNEL)
+        other_cost, other = minimum(minimum(chained, _WIDER)[1])
         best = other if other_cost < cost else best
     moved = forth @ Sim3.exp(steps_of(best)) @ back
     return [start[0], *(moved[chunk] for chunk in range(1, len(start)))]
