@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import re
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -20,7 +22,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 from PIL import Image
@@ -29,6 +31,7 @@ from bench_tools import DATASET, small_room
 from evidence_tools import turned
 from freegeo.cli.app import TERMINATED, main
 from freegeo.files import LEDGER_FILE, as_json, is_part
+from freegeo.host import end_with_parent
 from freegeo.models.da3_config import EMBEDDED_WEIGHTS
 from freegeo.run_folder import difference
 
@@ -37,6 +40,8 @@ FROZEN = ("--no-adapt", "--refine", "off", "--formats", "ply")
 CHUNKS = ("--chunk", "4", "--overlap", "3", "--order", "given", "--formats", "ply")
 FORMATS = ("ply", "glb", "colmap", "nerfstudio", "tum", "depth")
 BENCH = ("--data", "data", "-o", "out", "--datasets", DATASET, "--scenes", "1", "--device", "cpu")
+HANGS_S = 180.0
+"""Seconds after which a command, which takes a few, is taken for one that never ends."""
 PRELOADED = (
     "torch", "cv2", "pycolmap", "trimesh", "scipy.spatial", "scipy.ndimage", "scipy.sparse.linalg", "matplotlib.pyplot",
     "peft", "safetensors.torch", "cyclopts", "freegeo.sequence_job", "freegeo.refined", "freegeo.pools",
@@ -90,16 +95,16 @@ def _refinable(work: Path) -> None:
     from freegeo.export.reconstruction import Reconstruction
     from freegeo.files import write_json
 
-    scene = photograph_room(30_300_000, "val-tex", frames=8)
+    scene = photograph_room(30_300_000, "val-tex", frames=6)
     (work / "photos").mkdir()
     for photo in scene.photos:
         Image.fromarray(photo.read()).save(work / "photos" / photo.name)
     given = load_photos(work / "photos")
     height, width = given[0].size_hw
     found = Reconstruction(
-        depth_z=scene.depth_z.numpy(), conf=np.ones((8, height, width), np.float32),
+        depth_z=scene.depth_z.numpy(), conf=np.ones((6, height, width), np.float32),
         images=np.stack([photo.read() for photo in given]), names=tuple(photo.name for photo in given),
-        photo_hw=np.array([photo.size_hw for photo in given]), scale_xy=np.ones((8, 2)), offset_xy=np.zeros((8, 2)),
+        photo_hw=np.array([photo.size_hw for photo in given]), scale_xy=np.ones((6, 2)), offset_xy=np.zeros((6, 2)),
         T_cam_world=turned(scene.T_cam_world.double(), 2).float().numpy(), K=scene.K.numpy(),
     )  # fmt: skip
     found.save(work / "result")
@@ -116,7 +121,7 @@ def _nothing(work: Path) -> None:
 
 
 def _tiny() -> tuple[str, ...]:
-    return ("--model", "freegeo-tiny", "--checkpoint", str(EMBEDDED_WEIGHTS), "--device", "cpu")
+    return ("--model", "freegeo-tiny", "--checkpoint", str(EMBEDDED_WEIGHTS), "--device", "cpu", "--process-res", "48")
 
 
 COMMANDS = {
@@ -128,8 +133,8 @@ COMMANDS = {
     "batch": Command(("batch", "scenes/a", "scenes/b", "-o", "out", *_tiny(), *FROZEN), _two_scenes),
     "refine": Command(("refine", "result", "-o", "out", "--formats", "ply"), _refinable),
     "bench-predict": Command(
-        ("bench", "predict", "main", *BENCH, "--seeds", "43", "--views", "4", "--steps", "2", "--process-res", "112",
-         "--checkpoint", str(EMBEDDED_WEIGHTS)), _nothing,
+        ("bench", "predict", "main", *BENCH, "--seeds", "43", "--views", "4", "--steps", "2", "--sets", "2",
+         "--checkpoint", str(EMBEDDED_WEIGHTS), "--process-res", "48"), _nothing,
     ),
     "bench-evaluate": Command(("bench", "evaluate", *BENCH), _predicted),
 }  # fmt: skip
@@ -146,14 +151,29 @@ class Forked:
     It stays in the process group of its parent, so that one signal stops both, as when a machine stops.
     """
 
+    pipes: ClassVar[list[BinaryIO]] = []
+    """The ends that this process holds of the pipes by which workers notice that it is gone."""
+
     def __init__(self, command: Sequence[str], *, stdout: Any, env: Mapping[str, str], **options: object):
         self.returncode: int | None = None
+        theirs, ours = os.pipe()
+        self.stdin = os.fdopen(ours, "wb")
+        self.pipes.append(self.stdin)
         sys.stdout.flush()
         self.pid = os.fork()
         if self.pid == 0:
-            os.environ.update(env)
-            _speak_to(stdout.fileno())
-            _end(list(command[command.index("freegeo.cli.app") + 1 :]))
+            try:
+                os.dup2(theirs, 0)
+                # A worker that held one, its own or another's, would never see it close.
+                for pipe in self.pipes:
+                    pipe.close()
+                os.environ.update(env)
+                _speak_to(stdout.fileno())
+                end_with_parent()
+                _end(list(command[command.index("freegeo.cli.app") + 1 :]))
+            finally:
+                os._exit(71)
+        os.close(theirs)
 
     def poll(self) -> int | None:
         if self.returncode is None:
@@ -161,11 +181,13 @@ class Forked:
             self.returncode = os.waitstatus_to_exitcode(status) if pid else None
         return self.returncode
 
-    def wait(self, timeout: float | None = None) -> int:
-        while self.poll() is None:
+    def wait(self, timeout: float = math.inf) -> int:
+        deadline = time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            if time.monotonic() > deadline:
+                raise subprocess.TimeoutExpired("worker", timeout)
             time.sleep(0.01)
-        assert self.returncode is not None
-        return self.returncode
+        return code
 
     def terminate(self) -> None:
         os.kill(self.pid, signal.SIGTERM)
@@ -204,7 +226,8 @@ def _quicken() -> None:
     from freegeo.data.procedural import splits
 
     adapt.SAVE_EVERY_S = -1.0
-    pools.subprocess = type("subprocess", (), {"Popen": Forked, "DEVNULL": -3, "STDOUT": -2})
+    kept = ("PIPE", "STDOUT", "TimeoutExpired")
+    pools.subprocess = type("subprocess", (), {"Popen": Forked, **{name: getattr(subprocess, name) for name in kept}})
     pools.POLL_S = 0.01
     splits.photograph_room = small_room
     os.fsync = lambda descriptor: None
@@ -262,10 +285,13 @@ class Place:
         return self.ended(self.start(first, said=said), said=said)
 
     def ended(self, process: int, *, said: str = "said") -> Ended:
-        """Wait for a process of `start`."""
+        """Wait for a process of `start`; one that takes `HANGS_S` seconds is ended, with its workers."""
         started = time.monotonic()
-        _, status = os.waitpid(process, 0)
-        text = (self.root / said).read_text(errors="replace")
+        while not (done := os.waitpid(process, os.WNOHANG))[0]:
+            if time.monotonic() - started > HANGS_S:
+                os.killpg(process, signal.SIGKILL)
+            time.sleep(0.01)
+        status, text = done[1], (self.root / said).read_text(errors="replace")
         return Ended(os.waitstatus_to_exitcode(status), text, time.monotonic() - started)
 
     def difference(self) -> str:
@@ -287,6 +313,8 @@ def laid_out(root: Path, name: str) -> Place:
     """Make the inputs of a command below an empty folder, and run it once without disturbance."""
     for module in PRELOADED:
         import_module(module)
+    # A room takes seconds only where it is the first one of its kind.
+    small_room(20_000_003, "test-id", 4)
     place = Place(root, name)
     place.work.mkdir(parents=True)
 

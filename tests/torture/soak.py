@@ -1,10 +1,12 @@
 """Adapt, export and write the report again and again in one process, and see that nothing grows.
 
-`python -m torture.soak [COUNT]`, in the folder of the tests, prints memory, open files and threads after each round.
+`python -m torture.soak [COUNT] [--figure FILE]`, in the folder of the tests, prints memory, open files and threads of
+twenty rounds, and draws those of all.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import shutil
 import sys
@@ -22,6 +24,8 @@ from torture.commands import photos
 
 WARM_UP = 20
 """Rounds that fill caches and the pools of the allocators, and count for nothing."""
+SIDE = 48
+"""Pixels on the longer side of the photos for the model."""
 MOST_MB = 0.1
 """Megabytes that a round may add, by the slope of all rounds after those."""
 
@@ -46,9 +50,9 @@ def used() -> Used:
 def round_of(folder: Path, given: list, model) -> None:
     """Adapt to photos, predict, save the adapter and the result, export it and write its report."""
     out = folder / "round"
-    adapted = freegeo.adapt(model, given, steps=2, sets=2, guard="off")
+    adapted = freegeo.adapt(model, given, steps=2, sets=2, guard="off", process_res=SIDE)
     adapted.save(out / "adapter")
-    result = freegeo.reconstruct(model, given)
+    result = freegeo.reconstruct(model, given, process_res=SIDE)
     result.save(out)
     result.export(out, ["ply", "glb", "tum"])
     write_report(out)
@@ -75,9 +79,29 @@ def growth(looks: list[Used]) -> dict[str, float]:
     return {name: float(np.polyfit(range(len(after)), series, 1)[0]) for name, series in values.items()}
 
 
+def draw(looks: list[Used], path: Path) -> None:
+    """Draw memory, open files and threads over the rounds."""
+    import matplotlib.pyplot as plt
+
+    rounds = range(1, len(looks) + 1)
+    figure, axes = plt.subplots(figsize=(5, 3.2), layout="constrained")
+    axes.plot(rounds, [look.megabytes for look in looks])
+    axes.set(xlabel="round", ylabel="resident memory (MB)", xlim=(0, len(looks)), ylim=(0, None))
+    counts = axes.twinx()
+    counts.plot(rounds, [look.handles for look in looks], color="tab:orange", label="open files")
+    counts.plot(rounds, [look.threads for look in looks], color="tab:green", label="threads")
+    counts.set(ylabel="open files, threads", ylim=(0, 4 * max(look.handles for look in looks)))
+    counts.legend(loc="center right")
+    figure.savefig(path, dpi=100)
+
+
 def main() -> None:
     """Print a table and the slopes; exit code 1 when something grows."""
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 120
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("count", nargs="?", type=int, default=120)
+    parser.add_argument("--figure", type=Path)
+    options = parser.parse_args()
+    count = options.count
     if count < 2 * WARM_UP:
         sys.exit(f"at least {2 * WARM_UP} rounds are needed.")
     started = time.monotonic()
@@ -87,6 +111,8 @@ def main() -> None:
     for number, look in enumerate(looks, 1):
         if number % max(1, count // 20) == 0 or number == 1:
             print(f"{number:6}{look.megabytes:9.1f}{look.handles:9}{look.threads:9}")
+    if options.figure:
+        draw(looks, options.figure)
     slopes = growth(looks)
     print(f"{count} rounds in {time.monotonic() - started:.0f} s; growth per round after {WARM_UP}: ", end="")
     print(", ".join(f"{value:+.4f} {name}" for name, value in slopes.items()))
