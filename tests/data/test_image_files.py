@@ -1,6 +1,8 @@
 """Image files of every kind: told by content, upright whatever else their EXIF data say, with the right brightness."""
 
+import errno
 import io
+import os
 import shutil
 import struct
 import subprocess
@@ -55,6 +57,19 @@ def test_grey_maps_and_bitmaps(tmp_path):
 def test_files_for_which_pillow_would_start_programs_or_guess_are_refused(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     assert "not a readable image" in refusal(tmp_path / name) or "not a photo" in refusal(tmp_path / name)
+
+
+@pytest.mark.parametrize("opening", ["pathlib.Path.open", "PIL.Image.open"])
+def test_a_photo_is_not_to_blame_for_the_limit_of_open_files(tmp_path, monkeypatch, opening):
+    """Else it would be called damaged, or left out where that is allowed."""
+    save(tmp_path / "a.png")
+
+    def refuse(*arguments, **options):
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    monkeypatch.setattr(opening, refuse)
+    with pytest.raises(OSError, match="Too many open files"):
+        load_photos(tmp_path, skip_bad=True)
 
 
 def test_spider_and_raw_files_are_no_photos(tmp_path):

@@ -21,6 +21,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
 
@@ -303,6 +304,8 @@ class Place:
         return ", ".join(sorted(odd)[:4])
 
     def _differs(self, name: str) -> str:
+        if name.endswith(".html"):
+            return f"{name} differs ({_other_lines(self.whole / name, self.work / name)})"
         if not name.endswith(".json"):
             return f"{name} differs"
         before, now = (_without_times(json.loads((folder / name).read_text())) for folder in (self.whole, self.work))
@@ -343,6 +346,8 @@ def _forked(work: Path, said: Path, then: Callable[[], None], first: Callable[[]
         return process
     try:
         os.setpgid(0, 0)
+        # What a shell starts in the background would ignore it.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         os.chdir(work)
         with said.open("wb") as file:
             _speak_to(file.fileno())
@@ -367,7 +372,7 @@ _SECONDS = "seconds"
 """Name of JSON values that say how long stages took; one that a kill cut short may lack its time."""
 _TIMES = re.compile(
     r"\d\d\d\d-\d\d-\d\d[T ][\d:+.]+|\b\d+(\.\d+)? (s|min)\b|<tr><th>[^<]*</th><td>\d+\.\d</td></tr>"
-    r"|seconds</th><td>[^<]*|^  <td>\d+</td>$",
+    r"|<tr><th>[^<]*seconds</th><td>[^<]*</td></tr>|^  <td>\d+</td>$",
     re.M,
 )
 """Times in reports, and whole seconds in the table of a batch."""
@@ -400,6 +405,17 @@ def _content(path: Path) -> bytes:
     if path.suffix == ".html":
         return _TIMES.sub("", data.decode()).encode()
     return b"" if path.suffix == ".log" else data
+
+
+def _other_lines(before: Path, now: Path) -> str:
+    """Return the first lines in which pages differ but for times."""
+    lines = [_content(page).decode().splitlines() for page in (before, now)]
+    for number, (one, other) in enumerate(zip_longest(*lines, fillvalue="nothing"), 1):
+        if one != other:
+            start = next((k for k, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), 0)
+            near = slice(max(0, start - 60), start + 60)
+            return f"line {number}: {one[near]!r} / {other[near]!r}"
+    return "nothing"
 
 
 def _without_times(value: Any) -> Any:

@@ -174,6 +174,8 @@ def out_of_memory(error: BaseException) -> str | None:
 def _fail_to_write(error: OSError) -> int:
     full = error.errno in (errno.ENOSPC, errno.EDQUOT) and error.filename != console.STANDARD_OUTPUT
     hint = " Make room and run the same command again; it continues." if full else ""
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        hint = " Raise the limit (ulimit -n), or close other programs, and run the same command again; it continues."
     return console.fail(f"{error.filename or 'input or output'}: {error.strerror or error}.{hint}", FAILURE)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import struct
 import warnings
 from collections.abc import Generator
@@ -39,6 +40,8 @@ _DECODER_ERRORS = (
     OSError, SyntaxError, EOFError, ValueError, RuntimeError, TypeError, AttributeError, LookupError, ArithmeticError,
     struct.error,
 )  # fmt: skip
+_SHORTAGES = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM})
+"""Errors of the machine, which say nothing about the file that was to be read."""
 
 
 class UnreadableImageError(UserError):
@@ -54,7 +57,8 @@ class UnreadableImageError(UserError):
 def opened(path: Path) -> Generator[PillowImage]:
     """Open an image file with Pillow, without decoding its pixels.
 
-    `UnreadableImageError` when it is none, or larger than `MAX_PIXELS`.
+    `UnreadableImageError` when it is none, or larger than `MAX_PIXELS`; OSError when the machine has no memory or no
+    handles left, which no other file would help against.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -119,6 +123,7 @@ def _is_heif(path: Path) -> bool:
         with path.open("rb") as file:
             head = file.read(12)
     except OSError as error:
+        _require_no_shortage(error)
         raise UnreadableImageError(path, f"the file cannot be opened ({error.strerror})") from None
     return head[4:8] == b"ftyp" and head[8:] in _HEIF_BRANDS
 
@@ -127,7 +132,13 @@ def _too_large(path: Path, what: str) -> UnreadableImageError:
     return UnreadableImageError(path, f"{what} more than the limit of {MAX_PIXELS // 1_000_000} megapixels")
 
 
+def _require_no_shortage(error: BaseException) -> None:
+    if isinstance(error, OSError) and error.errno in _SHORTAGES:
+        raise error
+
+
 def _damaged(path: Path | str, error: BaseException) -> UnreadableImageError:
+    _require_no_shortage(error)
     return UnreadableImageError(path, f"the image is damaged or truncated ({' '.join(str(error).split())})")
 
 
