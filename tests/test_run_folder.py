@@ -271,6 +271,15 @@ def test_foreign_folder_is_never_touched(tmp_path, overwrite):
     assert [p.name for p in tmp_path.iterdir()] == ["holiday.txt"]
 
 
+def test_folders_without_files_are_no_files(tmp_path):
+    """A process whose output folder is removed at a bad moment may leave such, and they are in nobody's way."""
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    check_folder(tmp_path, SETTINGS, overwrite=False)
+    (tmp_path / "a" / "b" / "link").symlink_to(tmp_path / "nothing")
+    with pytest.raises(UserError, match="did not write"):
+        check_folder(tmp_path, SETTINGS, overwrite=False)
+
+
 @pytest.mark.parametrize("place", ["file", "file/below"])
 def test_file_in_the_way(tmp_path, place):
     (tmp_path / "file").write_text("mine")

@@ -217,7 +217,9 @@ def check_folder(
         raise UserError(f"{path}: is a file. Choose a folder for the output.")
     before = stored_state(path)
     if before is None:
-        if path.is_dir() and any(p.name not in OWN_FILES and not _is_left_over(p) for p in path.iterdir()):
+        if path.is_dir() and any(
+            p.name not in OWN_FILES and not _is_left_over(p) and _holds_files(p) for p in path.iterdir()
+        ):
             raise UserError(f"{path}: holds files that freegeo did not write. Choose an empty or a new folder.")
         require_writable(path)
         return
@@ -231,6 +233,11 @@ def check_folder(
             "Add --overwrite to replace it, or choose another folder."
         )
     require_writable(path)
+
+
+def _holds_files(path: Path) -> bool:
+    """Whether a path is a file or a link, or a folder with such somewhere in it."""
+    return path.is_symlink() or not path.is_dir() or any(map(_holds_files, path.iterdir()))
 
 
 def _is_left_over(path: Path) -> bool:

@@ -20,12 +20,13 @@ from cli.conftest import QUICK
 from freegeo import pools
 from freegeo.cli import console
 from freegeo.cli.app import build
-from freegeo.cli.batch import _in_worker, as_arguments, environments
+from freegeo.cli.batch import RECORD_NAME, _in_worker, _Table, as_arguments, environments
 from freegeo.cli.files import FileOptions, FilterOptions
 from freegeo.cli.options import ModelOptions, PhotoOptions, PlacingOptions, RecipeOptions
 from freegeo.cli.scenes import named_scenes
 from freegeo.errors import UserError
 from freegeo.files import read_json
+from freegeo.report.overview import SceneRow
 from freegeo.run_folder import run_folder
 from processes import kill_one, needs_proc
 
@@ -203,6 +204,18 @@ def test_a_cluster_that_is_not_there(freegeo, photo_folder, tiny, tmp_path, monk
     assert outcome.code == 2
     assert words in outcome.sentence()
     assert not (tmp_path / "out").exists()
+
+
+def test_no_scene_counts_as_done_before_the_page_shows_it(tmp_path, monkeypatch):
+    """Else a batch that is killed between the two has a page for good on which a finished scene is unfinished."""
+    table = _Table(tmp_path, [])
+    table.rows["a"] = SceneRow(name="a", outcome="frozen")
+    seen = []
+    monkeypatch.setattr(
+        "freegeo.report.overview.write_overview", lambda *_: seen.append((tmp_path / RECORD_NAME).exists())
+    )
+    table.write()
+    assert (seen, record.exists()) == ([False], True)
 
 
 def test_places_that_are_taken_are_refused(freegeo, photo_folder, tiny, tmp_path):

@@ -31,7 +31,7 @@ from PIL import Image
 from bench_tools import DATASET, small_room
 from evidence_tools import turned
 from freegeo.cli.app import TERMINATED, main
-from freegeo.files import LEDGER_FILE, as_json, is_part
+from freegeo.files import LEDGER_FILE, as_json
 from freegeo.host import end_with_parent
 from freegeo.models.da3_config import EMBEDDED_WEIGHTS
 from freegeo.run_folder import difference
@@ -395,7 +395,8 @@ def tree(folder: Path) -> dict[str, str]:
 def _content(path: Path) -> bytes:
     data = path.read_bytes()
     if path.name == LEDGER_FILE:
-        names = {line for line in data.decode().splitlines() if not is_part(Path(line))}
+        # What was removed since may be named or not.
+        names = {line for line in data.decode().splitlines() if (path.parent / line).exists()}
         return "\n".join(sorted(names)).encode()
     if path.suffix == ".json":
         try:

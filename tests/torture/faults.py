@@ -195,6 +195,8 @@ def _look_at(place: Place, ended: Ended, when: str, known: Watched, outcome: Out
         outcome.faults.append(f"{when}: code {ended.code}, {last[:200]}")
     # Their times, warnings and lists depend on what happened.
     names = {RUN_FILE, LEDGER_FILE, UNFINISHED_FILE, "reconstruction.json", "report.html", "index.html", "batch.json"}
+    if "could not be computed" in ended.said:
+        names |= {"results.csv", "results.jsonl"}
     for name, digest in tree(place.work).items():
         path = Path(name)
         # Without its photos an export is another one, and says so.
@@ -205,6 +207,8 @@ def _look_at(place: Place, ended: Ended, when: str, known: Watched, outcome: Out
 
 def _again(place: Place, when: str, outcome: Outcome) -> None:
     """Carry out the same command without the fault; what was taken away of the inputs is put back."""
+    if "output gone" in when and (ledger := place.root / "inputs" / _output(place).name / LEDGER_FILE).exists():
+        shutil.copytree(ledger.parent, _output(place), dirs_exist_ok=True)
     for path in (place.root / "inputs").rglob("*"):
         there = place.work / path.relative_to(place.root / "inputs")
         if not there.exists():

@@ -271,12 +271,15 @@ class _Table:
                 console.note(f"{row.name}: {_told(row)} ({done} of {len(self.works)} scenes done{rest})")
 
     def write(self) -> None:
-        """Write what is known by now."""
+        """Write what is known by now.
+
+        The record comes last: a scene that it calls done is not looked at again, so the page has to know of it.
+        """
         from freegeo.report.overview import write_overview
 
         rows = list(self.rows.values())
-        write_json(self.out / RECORD_NAME, {"format": 1, "scenes": [asdict(row) for row in rows]})
         write_overview(self.out, INDEX_NAME, rows)
+        write_json(self.out / RECORD_NAME, {"format": 1, "scenes": [asdict(row) for row in rows]})
 
     def say(self) -> None:
         """Print a line per scene of this command."""
