@@ -210,10 +210,8 @@ def test_no_scene_counts_as_done_before_the_page_shows_it(tmp_path, monkeypatch)
     """Else a batch that is killed between the two has a page for good on which a finished scene is unfinished."""
     table = _Table(tmp_path, [])
     table.rows["a"] = SceneRow(name="a", outcome="frozen")
-    seen = []
-    monkeypatch.setattr(
-        "freegeo.report.overview.write_overview", lambda *_: seen.append((tmp_path / RECORD_NAME).exists())
-    )
+    record, seen = tmp_path / RECORD_NAME, []
+    monkeypatch.setattr("freegeo.report.overview.write_overview", lambda *_: seen.append(record.exists()))
     table.write()
     assert (seen, record.exists()) == ([False], True)
 
