@@ -288,10 +288,15 @@ class Place:
     def ended(self, process: int, *, said: str = "said") -> Ended:
         """Wait for a process of `start`; one that takes `HANGS_S` seconds is ended, with its workers."""
         started = time.monotonic()
-        while not (done := os.waitpid(process, os.WNOHANG))[0]:
-            if time.monotonic() - started > HANGS_S:
-                os.killpg(process, signal.SIGKILL)
-            time.sleep(0.01)
+        try:
+            while not (done := os.waitpid(process, os.WNOHANG))[0]:
+                if time.monotonic() - started > HANGS_S:
+                    os.killpg(process, signal.SIGKILL)
+                time.sleep(0.01)
+        except KeyboardInterrupt:
+            os.killpg(process, signal.SIGKILL)
+            os.waitpid(process, 0)
+            raise
         status, text = done[1], (self.root / said).read_text(errors="replace")
         return Ended(os.waitstatus_to_exitcode(status), text, time.monotonic() - started)
 

@@ -122,13 +122,19 @@ def _judge(place: Place, ended: Ended, when: str, outcome: Outcome) -> None:
 def crash(
     root: Path, name: str, *, count: int, every: int = 1, seed: int = 0, completions: int = COMPLETIONS
 ) -> Outcome:
-    """Try one command below an empty folder, with `count` random kills and every so many points (0: none)."""
+    """Try one command below an empty folder, with `count` random kills and every so many points (0: none).
+
+    Ctrl-C ends it; what came of it by then is returned, with a fault that says so.
+    """
     outcome = Outcome()
     place = laid_out(root, name)
-    if every:
-        points(place, every, outcome)
-    if count:
-        kills(place, count, seed, outcome, completions)
+    try:
+        if every:
+            points(place, every, outcome)
+        if count:
+            kills(place, count, seed, outcome, completions)
+    except KeyboardInterrupt:
+        outcome.faults.append("stopped by Ctrl-C before the end")
     return outcome
 
 
