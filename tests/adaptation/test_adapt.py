@@ -630,6 +630,30 @@ def test_a_run_that_is_stopped_before_its_first_step_or_without_a_folder_saves_n
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("stage", ["on_step", "on_epoch"])
+def test_an_epoch_that_ended_as_the_run_was_stopped_is_announced_when_it_goes_on(tmp_path, stage):
+    """Else its adapter would never be kept, and the one of the epoch before would be taken for the last one."""
+
+    def train(kept, **options):
+        def keep(epoch, adapter):
+            kept[epoch] = [one.detach().clone() for one in adapter.parameters()]
+
+        recipe = quick(tiny_da3(), epochs=2, sets_per_scene=1, distinct_seeds=1, batch=1)
+        run(tiny_da3(), [noise_scene(4)], recipe, **{"on_epoch": keep, **options})
+
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    whole, kept = {}, {}
+    train(whole)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            train(kept, resume_in=tmp_path, **{stage: stop})
+    train(kept, resume_in=tmp_path)
+    assert kept.keys() == whole.keys() == {0, 1}
+    assert all(same(kept[epoch], whole[epoch]) for epoch in whole)
+
+
 def test_a_run_in_a_thread_takes_no_signals():
     """Handlers belong to the main thread."""
     model, found = tiny_da3(), []

@@ -143,7 +143,9 @@ def _disturb(place: Place, kind: str, number: int, changes: int) -> Callable[[],
         case "handles":
             return partial(scarce_handles, number / changes)
         case "output gone" | "input gone":
-            names = (_output(place).name,) if kind == "output gone" else ("photos", "scenes", "data")
+            # What the command itself puts there, such as generated rooms in `data`, is none of its inputs.
+            given = [name for name in ("photos", "scenes", "data") if (place.root / "inputs" / name).exists()]
+            names = [_output(place).name] if kind == "output gone" else given
             return at(place, number, lambda: [shutil.rmtree(place.work / name, ignore_errors=True) for name in names])
         case "SIGINT" | "SIGTERM":
             return at(place, number, lambda: os.kill(os.getpid(), signal.Signals[kind]))

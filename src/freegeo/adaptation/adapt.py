@@ -207,7 +207,8 @@ def adapt(
         resume_in: folder for the state of an unfinished run, written every 30 s and on Ctrl-C. The same call continues
             the run; on the CPU it ends with the same tensors as a run without a stop.
         on_step: called after every step.
-        on_epoch: called after every epoch with its number and the adapter.
+        on_epoch: called after every epoch with its number and the adapter; once more where a run goes on at the end of
+            an epoch.
         keep_after: shares of the steps, between 0 and 1, after which the adapter's state is kept (`Adapted.earlier`).
         own_loss: a term that is added to the loss of the student's views.
 
@@ -360,6 +361,9 @@ def _steps(run: _Run, plan: Plan, samples: Samples, state: _State) -> None:
     """Algorithm 1: per step, compare the student with the frozen teacher on every view set and update the adapter."""
     steps, adapter = run.steps, state.result.adapter
     saved_at = time.monotonic()
+    if state.next_step > 0:
+        # A run can be stopped after a step and before its epoch was announced.
+        _end_epoch(run, state, state.next_step - 1)
     for step in range(state.next_step, len(steps)):
         state.optimiser.zero_grad(set_to_none=True)
         with _training(run, plan, step):
@@ -367,14 +371,19 @@ def _steps(run: _Run, plan: Plan, samples: Samples, state: _State) -> None:
         terms = {name: torch.stack([part[name] for part in parts]).sum() for name in parts[0]}
         with undisturbed():
             state.update(terms)
-        epoch = steps[step][0].epoch
-        run.on_step(Progress(step=step, steps=len(steps), epoch=epoch, terms=terms))
-        if step + 1 == len(steps) or steps[step + 1][0].epoch != epoch:
-            state.read_terms()
-            run.on_epoch(epoch, adapter)
+        run.on_step(Progress(step=step, steps=len(steps), epoch=steps[step][0].epoch, terms=terms))
+        _end_epoch(run, state, step)
         if run.folder is not None and time.monotonic() - saved_at > SAVE_EVERY_S:
             state.save()
             saved_at = time.monotonic()
+
+
+def _end_epoch(run: _Run, state: _State, step: int) -> None:
+    """Announce an epoch whose last step was this one; nothing happens for other steps."""
+    steps, epoch = run.steps, run.steps[step][0].epoch
+    if step + 1 == len(steps) or steps[step + 1][0].epoch != epoch:
+        state.read_terms()
+        run.on_epoch(epoch, state.result.adapter)
 
 
 def _learn(
