@@ -13,6 +13,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,19 +80,20 @@ def growth(looks: list[Used]) -> dict[str, float]:
     return {name: float(np.polyfit(range(len(after)), series, 1)[0]) for name, series in values.items()}
 
 
-def draw(looks: list[Used], path: Path) -> None:
-    """Draw memory, open files and threads over the rounds."""
+def draw(looks: Mapping[int, Used], path: Path) -> None:
+    """Draw memory, open files and threads after rounds, by their number."""
     import matplotlib.pyplot as plt
 
-    rounds = range(1, len(looks) + 1)
+    rounds, most = list(looks), max(look.handles for look in looks.values())
     figure, axes = plt.subplots(figsize=(5, 3.2), layout="constrained")
-    axes.plot(rounds, [look.megabytes for look in looks])
-    axes.set(xlabel="round", ylabel="resident memory (MB)", xlim=(0, len(looks)), ylim=(0, None))
+    lines = axes.plot(rounds, [look.megabytes for look in looks.values()], label="memory")
     counts = axes.twinx()
-    counts.plot(rounds, [look.handles for look in looks], color="tab:orange", label="open files")
-    counts.plot(rounds, [look.threads for look in looks], color="tab:green", label="threads")
-    counts.set(ylabel="open files, threads", ylim=(0, 4 * max(look.handles for look in looks)))
-    counts.legend(loc="center right")
+    lines += counts.plot(rounds, [look.handles for look in looks.values()], color="tab:orange", label="open files")
+    lines += counts.plot(rounds, [look.threads for look in looks.values()], color="tab:green", label="threads")
+    axes.set(xlabel="round", ylabel="resident memory (MB)", xlim=(0, rounds[-1]))
+    axes.set_ylim(0, 1.2 * max(look.megabytes for look in looks.values()))
+    counts.set(ylabel="open files, threads", ylim=(0, 4 * most))
+    axes.legend(handles=lines, loc="center right")
     figure.savefig(path, dpi=100)
 
 
@@ -112,7 +114,7 @@ def main() -> None:
         if number % max(1, count // 20) == 0 or number == 1:
             print(f"{number:6}{look.megabytes:9.1f}{look.handles:9}{look.threads:9}")
     if options.figure:
-        draw(looks, options.figure)
+        draw(dict(enumerate(looks, 1)), options.figure)
     slopes = growth(looks)
     print(f"{count} rounds in {time.monotonic() - started:.0f} s; growth per round after {WARM_UP}: ", end="")
     print(", ".join(f"{value:+.4f} {name}" for name, value in slopes.items()))
