@@ -44,6 +44,8 @@ _LOCAL_HEADER, _ZIP64_FIELD = 30, 20
 """Bytes of the header before a member of a zip file, without its name and extra fields, and of the field for sizes."""
 _PADDING_KIND, _ALIGNMENT = 0xD935, 64
 _BLOCK = 1 << 20
+_MOST_DIGITS = 300
+"""Of whole numbers in JSON; every number of so many can become a float."""
 _MOST_PACKED = 1100
 """No more bytes than this come out of one byte of a zip file."""
 _NPZ_ERRORS = (
@@ -384,11 +386,27 @@ def json_of(text: str, path: Path, schema: Any = Any, *, advice: str = AGAIN) ->
     import msgspec
 
     try:
-        value = json.loads(text)
+        value = json_value(text)
         msgspec.convert(value, schema)
-    except (ValueError, RecursionError) as error:  # numbers of too many digits, msgspec.ValidationError
+    except (ValueError, RecursionError) as error:
         raise DamagedError(path, error, advice) from None
     return value
+
+
+def json_value(text: str) -> Any:
+    """Return the value of a JSON text.
+
+    Raises:
+        ValueError: it is none, or has a whole number that is larger than any float.
+        RecursionError: it is nested too deeply.
+    """
+    return json.loads(text, parse_int=_whole_number)
+
+
+def _whole_number(digits: str) -> int:
+    if len(digits) > _MOST_DIGITS:
+        raise ValueError(f"a number of {len(digits)} digits")
+    return int(digits)
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:

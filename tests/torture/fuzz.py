@@ -1,15 +1,16 @@
-"""Damage every kind of file that freegeo reads, in this process, and report what is neither a result nor a sentence.
+"""Damage every kind of file that freegeo reads, and report what is neither a result nor a sentence.
 
-`python -m torture.fuzz [CASES] [SEED] [READER ...]`, in the folder of the tests, prints a table; `test_fuzz.py` runs a
-small part of it. Each case is one
-reader and one mutation, both decided by the seed and the number of the case.
+`python -m torture.fuzz [CASES] [SEED] [READER ...]`, in the folder of the tests, uses two processes and prints a table;
+`test_fuzz.py` runs a part of it. Each case is one reader and one mutation, decided by seed, reader and number alone.
 """
 
 from __future__ import annotations
 
 import copy
+import faulthandler
 import json
 import logging
+import multiprocessing
 import os
 import random
 import resource
@@ -21,8 +22,10 @@ import time
 import traceback
 import warnings
 import zipfile
+import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -42,8 +45,15 @@ ODD = (
     None, True, 0, -1, 1, 2**31, 2**63, 10**400, 1.5, float("nan"), float("inf"), "", "x", "..", "/etc/passwd", "\0",
     [], {}, [[]], [None], {"a": 1}, "1" * 5000, ["x"] * 3, -1e308, "1e999",
 )  # fmt: skip
+TEXTS = ("[" * 100_000, '{"a":' * 50_000, "9" * 5_000, "", "\ufeff{}", "null", "[]", "\ud800")
+"""Texts that parsers of JSON stumble over, in the place of a whole file."""
+SIDES = (0, 1, 2, 13, 255, 16_383, 60_000, 65_535, 2**31 - 1, 2**32 - 1)
 DTYPES = ("?", "i1", "u1", "<i8", "<f2", "<f4", ">f8", "<c8", "<U3", "S2", "O", "<M8[s]", "V3", "<u8")
+HUGE = ((1 << 33,), (1 << 62, 8), (-1,), (1 << 20, 1 << 14))
 SHAPES = ((), (0,), (1,), (3,), (2, 0), (1, 1), (2, 3), (1, 4, 4), (3, 3, 3), (2, 2, 2, 2), (0, 0, 0))
+
+
+NAMES = tuple(reader.name for reader in READERS)
 
 
 class TooSlow(BaseException):
@@ -57,6 +67,7 @@ class Outcome:
     cases: int = 0
     read: int = 0
     refused: int = 0
+    seconds: float = 0.0
     faults: Counter = field(default_factory=Counter)
     """What went wrong, and how often."""
 
@@ -85,8 +96,11 @@ def flipped(data: bytes, rng: random.Random) -> bytes:
 
 
 def changed_json(data: bytes, rng: random.Random) -> bytes:
-    """Replace, remove, add or double a value somewhere in a JSON text."""
-    return json.dumps(changed_value(json.loads(data), rng)).encode()
+    """Replace, remove, add or double a value somewhere in a JSON text, or write a number of 5,000 digits there."""
+    if rng.random() < 0.03:
+        return rng.choice(TEXTS).encode("utf-8", "surrogatepass")
+    text = json.dumps(changed_value(json.loads(data), rng))
+    return (text.replace("1", "9" * 5_000, 1) if rng.random() < 0.03 else text).encode()
 
 
 def changed_value(value: Any, rng: random.Random) -> Any:
@@ -124,11 +138,60 @@ def changed_lines(data: bytes, rng: random.Random) -> bytes:
 
 
 def changed_words(data: bytes, rng: random.Random) -> bytes:
-    """Change one word of a text."""
-    words = data.decode().split(" ")
+    """Change one word of a text, which may be followed by bytes."""
+    words = data.split(b" ")
     place = rng.randrange(len(words))
-    words[place] = str(rng.choice((*ODD[:15], "1e400", "--", "\n", "#", "nan", "é")))
-    return " ".join(words).encode("utf-8", "surrogateescape")
+    words[place] = str(rng.choice((*ODD[:15], "1e400", "--", "\n", "#", "nan", "é", "[" * 5_000))).encode()
+    return b" ".join(words)
+
+
+def changed_png(data: bytes, rng: random.Random) -> bytes:
+    """Change size, depth or kind of a PNG, or bytes of one of its chunks; checksums fit."""
+    place, chunks = 8, []
+    while place < len(data):
+        (length,) = struct.unpack_from(">I", data, place)
+        chunks.append((data[place + 4 : place + 8], data[place + 8 : place + 8 + length]))
+        place += 12 + length
+    chosen = 0 if rng.random() < 0.4 else rng.randrange(len(chunks))
+    kind, body = chunks[chosen]
+    if chosen == 0:
+        width, height, *rest = struct.unpack(">IIBBBBB", body)
+        match rng.randrange(3):
+            case 0:
+                width, height = rng.choice((width, *SIDES)), rng.choice((height, *SIDES))
+            case 1:
+                rest[0], rest[1] = rng.choice((1, 2, 4, 8, 16, 3)), rng.choice((0, 2, 3, 4, 6, 1))
+            case _:
+                rest[rng.randrange(5)] = rng.randrange(256)
+        body = struct.pack(">IIBBBBB", width, height, *rest)
+    elif kind == b"IDAT" and rng.random() < 0.5:
+        try:
+            body = zlib.compress(flipped(zlib.decompress(body), rng))
+        except zlib.error:
+            body = flipped(body, rng)
+    else:
+        body = flipped(body, rng)
+    chunks[chosen] = (kind, body)
+    if rng.random() < 0.1:
+        chunks.insert(rng.randrange(len(chunks)), rng.choice(chunks))
+    return data[:8] + b"".join(
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in chunks
+    )
+
+
+def changed_npy(data: bytes, rng: random.Random) -> bytes:
+    """Replace an array by one of another type, shape or content, or its header alone."""
+    if rng.random() < 0.3:
+        return _header(rng.choice(DTYPES), rng.choice(HUGE))
+    return _array(rng, data)
+
+
+def changed_archive(data: bytes, rng: random.Random) -> bytes:
+    """Change bytes of a file in an archive; checksums fit."""
+    members = _members(data)
+    name = rng.choice(list(members))
+    members[name] = flipped(members[name], rng)
+    return _archive(members, rng)
 
 
 def changed_npz(data: bytes, rng: random.Random) -> bytes:
@@ -145,9 +208,7 @@ def changed_npz(data: bytes, rng: random.Random) -> bytes:
             case 2:
                 arrays[name] = flipped(arrays.get(name, b"x"), rng)
             case 3:
-                arrays[name] = _header(
-                    rng.choice(DTYPES), rng.choice(((1 << 33,), (1 << 62, 8), (-1,), (1 << 20, 1 << 14)))
-                )
+                arrays[name] = _header(rng.choice(DTYPES), rng.choice(HUGE))
             case 4:
                 arrays[name] = rng.choice((b"", b"\x93NUMPY", b"\x93NUMPY\x09\0" + bytes(99)))
             case _:
@@ -245,7 +306,8 @@ def _retyped(header: dict[str, Any], name: str, body: bytes, rng: random.Random)
 
 CHANGES: dict[str, Callable[[bytes, random.Random], bytes]] = {
     ".json": changed_json, ".jsonl": changed_lines, ".npz": changed_npz, ".safetensors": changed_safetensors,
-    ".txt": changed_words,
+    ".txt": changed_words, ".toml": changed_words, ".ply": changed_words, ".png": changed_png, ".npy": changed_npy,
+    ".pt": changed_archive,
 }  # fmt: skip
 
 
@@ -295,6 +357,8 @@ def case(reader: Reader, original: Path, victim: Path, rng: random.Random, outco
     victim.write_bytes(mutated(original, rng))
     outcome.cases += 1
     signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
+    # What hangs in compiled code is not interrupted by a signal: it ends the process, and says where.
+    faulthandler.dump_traceback_later(2 * LIMIT_S, exit=True)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -309,42 +373,65 @@ def case(reader: Reader, original: Path, victim: Path, rng: random.Random, outco
         outcome.faults[described(error)] += 1
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
+        faulthandler.cancel_dump_traceback_later()
 
 
-def fuzz(folder: Path, cases: int, seed: int, only: tuple[str, ...] = ()) -> dict[str, Outcome]:
-    """Run so many cases, spread evenly over the readers, with files below a folder; returns outcomes by reader."""
-    outcomes = {}
-    # What is written survives no power cut here, and need not.
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Print no warnings, and do not wait for the disk: what is written survives no power cut here, and need not."""
     flush, os.fsync = os.fsync, lambda descriptor: None
     logging.disable(logging.WARNING)
-    chosen = [reader for reader in READERS if not only or reader.name in only]
-    share = -(-cases // len(chosen))
-    prepared = []
-    for place, reader in enumerate(chosen):
-        path = reader.write(folder / f"case {place}" / "files")
-        reader.read(path)
-        prepared.append((reader, path, path.read_bytes()))
-    with limits():
-        for reader, path, content in prepared:
-            outcome = outcomes[reader.name] = Outcome()
-            original = folder / f"original{path.suffix}"
-            original.write_bytes(content)
-            for number in range(share):
-                case(reader, original, path, random.Random(f"{seed} {reader.name} {number}"), outcome)
-    logging.disable(logging.NOTSET)
-    os.fsync = flush
-    return outcomes
+    try:
+        yield
+    finally:
+        logging.disable(logging.NOTSET)
+        os.fsync = flush
+
+
+def fuzz_reader(folder: Path, name: str, cases: int, seed: int) -> Outcome:
+    """Run cases of one reader in a new folder, in which nothing may appear but in the places that it is given."""
+    reader = next(reader for reader in READERS if reader.name == name)
+    here, outcome = Path.cwd(), Outcome()
+    (folder / "empty").mkdir(parents=True)
+    os.chdir(folder / "empty")
+    try:
+        with quiet():
+            victim = reader.write(folder / "files")
+            reader.read(victim)
+            original = folder / f"original{victim.suffix}"
+            original.write_bytes(victim.read_bytes())
+            started = time.monotonic()
+            with limits():
+                for number in range(cases):
+                    case(reader, original, victim, random.Random(f"{seed} {name} {number}"), outcome)
+            outcome.seconds = time.monotonic() - started
+    finally:
+        os.chdir(here)
+    known = {folder / "empty", folder / "files", folder / "exported", original}
+    for path in [*sorted(set(folder.iterdir()) - known), *(folder / "empty").iterdir()]:
+        outcome.faults[f"wrote {path.relative_to(folder)}"] += 1
+    return outcome
+
+
+def fuzz(folder: Path, cases: int, seed: int, names: Sequence[str] = NAMES, processes: int = 1) -> dict[str, Outcome]:
+    """Run so many cases, spread evenly over readers, with files below a folder; returns outcomes by reader."""
+    share = -(-cases // len(names))
+    work = [(folder / f"{place}", name, share, seed) for place, name in enumerate(names)]
+    if processes == 1:
+        return {item[1]: fuzz_reader(*item) for item in work}
+    with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return dict(zip(names, pool.map(fuzz_reader, *zip(*work, strict=True)), strict=True))
 
 
 def main() -> None:
     """Print a table of outcomes, then the faults."""
-    cases, seed = (int(value) for value in (sys.argv[1:3] + ["2000", "0"][len(sys.argv[1:3]) :]))
+    cases, seed = (int(value) for value in (sys.argv[1:3] + ["20000", "0"][len(sys.argv[1:3]) :]))
     started = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
-        outcomes = fuzz(Path(folder), cases, seed, tuple(sys.argv[3:]))
-    print(f"{'reader':24}{'cases':>8}{'read':>8}{'refused':>9}{'faults':>8}")
+        outcomes = fuzz(Path(folder), cases, seed, sys.argv[3:] or NAMES, processes=2)
+    print(f"{'reader':24}{'cases':>8}{'read':>8}{'refused':>9}{'faults':>8}{'ms a case':>11}")
     for name, o in outcomes.items():
-        print(f"{name:24}{o.cases:8}{o.read:8}{o.refused:9}{sum(o.faults.values()):8}")
+        print(f"{name:24}{o.cases:8}{o.read:8}{o.refused:9}{sum(o.faults.values()):8}{1000 * o.seconds / o.cases:11.1f}")
     total = sum(o.cases for o in outcomes.values())
     faults = sum(sum(o.faults.values()) for o in outcomes.values())
     print(f"{total} cases in {time.monotonic() - started:.0f} s, {faults} faults")

@@ -1,12 +1,13 @@
-"""A small part of the fuzzer in every run of the suite; `make torture` runs the long one."""
+"""Damaged files of every kind: each is read, or refused in one sentence; `make torture` tries more of them."""
 
 import pytest
 
-from torture.fuzz import fuzz
+from torture.fuzz import NAMES, fuzz
 
 QUICK = (
     "matches.npz", "weights", "weights index", "adapter config", "adapter notes", "adapter state", "photo .jpg",
 )  # fmt: skip
+SHARES = 4
 
 
 def faults(outcomes) -> list[str]:
@@ -22,5 +23,8 @@ def test_damaged_files_are_read_or_refused_in_one_sentence(tmp_path):
 
 
 @pytest.mark.slow
-def test_every_reader(tmp_path):
-    assert faults(fuzz(tmp_path, 1_000, 1)) == []
+@pytest.mark.parametrize("share", range(SHARES))
+def test_every_kind(tmp_path, share):
+    outcomes = fuzz(tmp_path, 10_000 // SHARES, 1, NAMES[share::SHARES])
+    assert faults(outcomes) == []
+    assert all(outcome.refused for outcome in outcomes.values())

@@ -230,6 +230,9 @@ def read_peft(folder: Path) -> tuple[Mapping[str, Any], dict[str, Tensor]]:
     tensors = {name.removeprefix(PEFT_PREFIX): value for name, value in tensors.items()}
     if not lora_layers(tensors):
         raise UserError(f"{folder / WEIGHTS}: no LoRA matrices in it. Give the folder that `freegeo adapt` wrote.")
+    ranks = {value.shape[:1] for name, value in tensors.items() if name.endswith(".lora_A.weight")}
+    if ranks != {(config["r"],)}:
+        raise UserError(f"{folder}: its matrices are not of the rank {config['r']} that {CONFIG} says. Copy it again.")
     return config, tensors
 
 

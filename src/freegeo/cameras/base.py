@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from freegeo.cameras.known import Lens
 from freegeo.errors import UserError
+from freegeo.files import json_value
 
 if TYPE_CHECKING:
     from freegeo.cameras.known import KnownCameras
@@ -109,16 +109,17 @@ def find_frames(path: Path, name: str, is_own: Callable[[Any], bool]) -> Path | 
     if file.suffix.lower() != ".json" or not file.is_file():
         return None
     try:
-        return file if is_own(json.loads(file.read_text(encoding="utf-8-sig"))["frames"]) else None
-    except (ValueError, KeyError, TypeError, OSError):
+        return file if is_own(json_value(file.read_text(encoding="utf-8-sig"))["frames"]) else None
+    except (ValueError, KeyError, TypeError, OSError, RecursionError):
         return None
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file; UserError when it is broken, or something else."""
+    text = read_text(path)
     try:
-        content = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
+        content = json_value(text)
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: broken JSON ({error}).") from None
     if not isinstance(content, dict):
         raise UserError(f"{path}: holds no JSON object.")

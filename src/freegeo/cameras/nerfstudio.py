@@ -7,6 +7,7 @@ the poses were written; they belong to the world afterwards, and so do results: 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -76,8 +77,8 @@ class _Values:
         value = self.get(key)
         if value is None:
             return None
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise UserError(f"{self.where}: {key} is {value!r}, which is no number.")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise UserError(f"{self.where}: {key} is {value!r:.40}, which is no number.")
         return float(value)
 
 

@@ -31,6 +31,8 @@ __all__ = ["read_camera_file", "read_cameras"]
 
 logger = logging.getLogger(__name__)
 
+LONGEST_SIDE = 1_000_000
+"""Pixels of a side beyond which a number is no size of an image."""
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R^T R - 1 that counts as rounding."""
 SMALLEST_FOCAL = 0.05
@@ -130,8 +132,8 @@ def _checked(camera: FileCamera, file: CameraFile, reading: str, photo: PhotoLik
     """Return a camera of a file whose numbers make sense by themselves; UserError otherwise."""
     where = f"{file.source}: the camera of {camera.name}"
     size = camera.size_hw
-    if size is not None and min(size) < 1:
-        raise UserError(f"{where} has an image of {size[1]} x {size[0]} pixels.")
+    if size is not None and not 1 <= min(size) <= max(size) <= LONGEST_SIDE:
+        raise UserError(f"{where} is of an image with a side that is not between 1 and {LONGEST_SIDE:,} pixels.")
     K = camera.K
     if camera.angle_x is not None:
         if photo is None:

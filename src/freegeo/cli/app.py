@@ -214,7 +214,7 @@ def checked_config(path: Path) -> Path:
             content = tomllib.load(file)
     except OSError as error:
         raise UserError(f"--config {path}: {error.strerror}. Check the name.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(f"--config {path}: not a TOML file ({error}).") from None
     for name, table in content.items():
         if name not in COMMANDS or not isinstance(table, dict):

@@ -1,5 +1,6 @@
 """Reading the cameras and poses of a COLMAP model, text or binary, without pycolmap."""
 
+import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +29,8 @@ _MODELS = (  # name and number of parameters, at the position that is COLMAP's n
 _TWO_FOCAL_LENGTHS = frozenset(
     {"PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"}
 )
-_POINT_BYTES = 24
+_CAMERA_BYTES, _IMAGE_BYTES, _POINT_BYTES = 48, 73, 24
+"""Fewest bytes of a camera, and of an image without a name and points; bytes of a point of an image."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ def _is_number(token: str) -> bool:
 def _binary_cameras(path: Path) -> list[ColmapCamera]:
     with path.open("rb") as file:
         cameras = []
-        for _ in range(_read(file, "<Q")[0]):
+        for _ in range(_count(file, _CAMERA_BYTES)):
             number, model_number, width, height = _read(file, "<iiQQ")
             if not 0 <= model_number < len(_MODELS):
                 raise ValueError(f"camera {number} has the unknown model {model_number}")
@@ -154,18 +156,26 @@ def _binary_cameras(path: Path) -> list[ColmapCamera]:
 def _binary_images(path: Path) -> list[ColmapImage]:
     with path.open("rb") as file:
         images = []
-        for _ in range(_read(file, "<Q")[0]):
+        for _ in range(_count(file, _IMAGE_BYTES)):
             number, *pose, camera = _read(file, "<i7di")
             name = bytearray()
             while (letter := _read(file, "<c")[0]) != b"\0":
                 name += letter
             images.append(ColmapImage(name.decode("utf-8"), camera, _pose(pose[:4], pose[4:]), number))
-            file.seek(_POINT_BYTES * _read(file, "<Q")[0], 1)
+            file.seek(_POINT_BYTES * _count(file, _POINT_BYTES), 1)
         return images
 
 
 def _read(file: BinaryIO, layout: str) -> tuple:
     return struct.unpack(layout, file.read(struct.calcsize(layout)))
+
+
+def _count(file: BinaryIO, size: int) -> int:
+    """Read how many things of at least `size` bytes follow; ValueError when the file is too short for them."""
+    (count,) = _read(file, "<Q")
+    if count * size > os.fstat(file.fileno()).st_size - file.tell():
+        raise ValueError(f"it ends before the {count} entries that it announces")
+    return count
 
 
 def _pose(quat_wxyz: list[float], translation: list[float]) -> np.ndarray:

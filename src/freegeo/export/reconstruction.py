@@ -45,6 +45,8 @@ METRIC_MODEL = "a metric model"
 _OPTIONAL = ("T_cam_world", "K", "sky")
 _CAMERAS = ("T_cam_world", "K")
 _VIEWS = (-1, -1, -1)
+_ROTATION_SLACK = 0.01
+"""Largest entry of R R^T - 1 in a file; that of float32 rotations is a thousand times smaller."""
 _KINDS: dict[str, files.Kind] = {
     "depth_z": ("f", _VIEWS), "conf": ("f", _VIEWS), "images": ("u", (-1, -1, -1, 3)), "names": ("U", (-1,)),
     "photo_hw": ("iu", (-1, 2)), "scale_xy": ("f", (-1, 2)), "offset_xy": ("f", (-1, 2)),
@@ -345,9 +347,27 @@ class Reconstruction:
             n: arrays[n].astype(types.get(n, np.float32), copy=False) for n in names if n in arrays and n != "names"
         }
         try:
-            return cls(**values, names=tuple(map(str, arrays["names"])), scale=Scale.from_arrays(arrays))
+            found = cls(**values, names=tuple(map(str, arrays["names"])), scale=Scale.from_arrays(arrays))
         except (FreeGeoError, ValueError) as error:
             raise FreeGeoError(f"{file}: not a reconstruction ({error}) Name another file.") from None
+        for name, are_cameras in found._camera_checks().items():
+            if not are_cameras.all():
+                view = found.names[int(np.argmin(are_cameras))]
+                raise FreeGeoError(f"{file}: damaged, {name} of {view!r} is not that of a camera. Run again.")
+        return found
+
+    def _camera_checks(self) -> dict[str, np.ndarray]:
+        """Return by field which views (S,) bool have numbers that a camera can have."""
+        checks = {}
+        with np.errstate(all="ignore"):
+            if self.T_cam_world is not None:
+                R = self.T_cam_world[:, :3, :3].astype(np.float64)
+                square = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
+                checks["T_cam_world"] = np.isfinite(self.T_cam_world).all((1, 2)) & (square < _ROTATION_SLACK)
+            if self.K is not None:
+                focal = np.minimum(self.K[:, 0, 0], self.K[:, 1, 1])
+                checks["K"] = np.isfinite(self.K).all((1, 2)) & (focal > 0)
+        return checks
 
 
 def save_streamed(

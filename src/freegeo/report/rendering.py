@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from markupsafe import Markup
 
 _CODE = re.compile(r"`([^`\n]+)`")
@@ -16,13 +18,19 @@ def fill(template: str, *, package: str = "freegeo.report", **values: Any) -> st
 
     Templates have the filter `marked` for sentences that the command line prints as they are.
     """
+    return _environment(package).get_template(template).render(**values)
+
+
+@cache
+def _environment(package: str) -> Environment:
+    """Return what keeps the templates of a package compiled."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
         loader=PackageLoader(package), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.filters["marked"] = marked
-    return environment.get_template(template).render(**values)
+    return environment
 
 
 def marked(sentence: object) -> Markup:
