@@ -3,6 +3,12 @@
 _LONGEST_REASON = 300
 
 
+def in_short(reason: object) -> str:
+    """Return what is said of something on one line, cut off where it is long, as it is with the content of a file."""
+    text = " ".join(str(reason).split())
+    return text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}..."
+
+
 class FreeGeoError(Exception):
     """The work failed for a reason we understand (exit code 1)."""
 
@@ -15,8 +21,7 @@ class DamagedError(FreeGeoError):
     """A file that freegeo wrote, or one like it, whose content is not what it has to be."""
 
     def __init__(self, path: object, reason: object, advice: str) -> None:
-        text = " ".join(str(reason).split())
-        self.reason = text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}..."
+        self.reason = in_short(reason)
         super().__init__(f"{path}: damaged file ({self.reason}). {advice}")
 
 

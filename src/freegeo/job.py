@@ -10,7 +10,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Required, TypedDict
 
 import numpy as np
 import torch
@@ -101,6 +101,18 @@ DEPTH_SIZE = Part("depth_size", (), free=True)
 PARTS = (ADAPTATION, PREDICTION, PLACING, REFINEMENT, FILTERS, FORMATS, DEPTH_SIZE)
 """Parts of a job's settings: photos, model and adapter; how they are used; known and shared cameras, and scale; whether
 bundle adjustment follows; which pixels become points; which files; at which size depth is written."""
+
+
+class _Step(TypedDict):
+    total: float
+
+
+class _Notes(TypedDict, total=False):
+    """Of the notes of the run's own adapter, what is read again."""
+
+    loss_curve: Required[list[_Step]]
+    trouble: str | None
+    verdict: dict[str, Any] | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,7 +331,7 @@ class Job:
             result.save(folder)
         # A process that was killed after it had written the adapter has left it.
         remove_state(folder)
-        metadata = read_json(folder / METADATA)
+        metadata = read_json(folder / METADATA, _Notes)
         return metadata.get("trouble"), metadata.get("verdict")
 
     def _scene_images(self) -> SceneImages:
@@ -527,7 +539,7 @@ class Job:
         metadata = self.folder / ADAPTER_FOLDER / METADATA
         if self.recipe is None or not metadata.is_file():
             return None
-        return loss_change(read_json(metadata)["loss_curve"])
+        return loss_change(read_json(metadata, _Notes)["loss_curve"])
 
     @contextmanager
     def _timed(self, stage: str, part: Part = PREDICTION) -> Generator[None]:

@@ -12,7 +12,9 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from numbers import Integral
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict, get_args
+
+from msgspec import Meta
 
 import numpy as np
 
@@ -76,6 +78,23 @@ LABELS = {
     "judged_by": "the predictions that the guard judges by",
 }  # fmt: skip
 """What messages call the settings of an output folder."""
+
+
+class _Piece(TypedDict):
+    folder: str
+    frames: int
+
+
+class _Sequence(TypedDict):
+    frames: int
+    pieces: Annotated[list[_Piece], Meta(min_length=1)]
+
+
+class _Record(TypedDict, total=False):
+    """Of a finished result's reconstruction.json, what is read again."""
+
+    not_written: dict[str, str] | None
+    sequence: _Sequence | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -452,7 +471,7 @@ def run_in_folder(
     parts = PARTS if found.chunks is None else SEQUENCE_PARTS
     with run_folder(output, settings, overwrite=overwrite, parts=parts, labels=LABELS) as folder:
         if folder.finished:
-            return read_json(folder / SUMMARY_NAME), folder.finished_at
+            return read_json(folder / SUMMARY_NAME, _Record, advice="Run again with --overwrite."), folder.finished_at
         if unchecked is not None:
             _check_cameras(unchecked, found.photos, folder / MATCHES_NAME)
         if any(isinstance(photo, VideoFrame | UndistortedPhoto) for photo in found.photos):

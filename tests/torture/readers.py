@@ -8,7 +8,7 @@ import json
 import shutil
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from unittest import mock
@@ -32,6 +32,7 @@ from freegeo.benchmark.tasks import DAMAGED
 from freegeo.cameras.reading import read_camera_file, read_cameras
 from freegeo.cli import demo
 from freegeo.cli.app import checked_config, main
+from freegeo.cli.batch import stored_rows
 from freegeo.data.datasets import registry
 from freegeo.data.masks import load_masks as read_masks
 from freegeo.data.photos import MemoryPhoto, load_photos
@@ -46,8 +47,10 @@ from freegeo.fusion.tracks import Tracks
 from freegeo.models.checkpoints import fingerprint, load_weights, require_fit, save_weights
 from freegeo.models.da3_config import KEYS
 from freegeo.report import figures
+from freegeo.report.overview import SceneRow, write_overview
 from freegeo.report.page import write_report
 from freegeo.run_folder import run_folder
+from freegeo.training.curve import read_log
 from tiny_models import tiny_da3, trained
 
 VIEWS, SIZE = 3, (12, 16)
@@ -83,7 +86,7 @@ def _result(folder: Path) -> Path:
         save_kept(folder, filtered, np.ones(scene.depth_z.shape, bool))
         files.write_json(
             folder / "reconstruction.json",
-            {"images": list(scene.names), "photo_files": [None] * VIEWS, "refinement": {}, "warnings": ["w"]},
+            {"images": list(scene.names), "photo_files": [None] * VIEWS, "refinement": None, "warnings": ["w"]},
         )
         run.finish()
     return folder
@@ -129,6 +132,67 @@ def _use_matches(file: Path) -> None:
 
 def _example(name: str) -> Callable[[Path], Path]:
     return lambda folder: write_example(folder, views=2, hw=SIZE) / name
+
+
+def _summary(folder: Path) -> Path:
+    """Return a reconstruction.json in which everything that is shown somewhere has a value."""
+    path = write_example(folder, views=2, hw=SIZE) / "reconstruction.json"
+    scores = {
+        "epipolar_px": 1.0, "reprojection_px": 1.0, "depth_agreement": 0.5, "depth_agreement_frozen": 0.6, "matches": 9,
+    }  # fmt: skip
+    trial = {"steps": 1.0, "strength": 1.0, **scores, "probability": 0.9}
+    seam = {"first": 0, "second": 1, "kind": "neighbours", "used": True, "frames": 1, "inliers": 0.5, "rms": 0.1}
+    more = {
+        "image_hw": list(SIZE), "photo_files": [{"file": "a.jpg", "sha256": "0"}, None], "warnings": ["w"],
+        "not_written": {"ply": "w"}, "filters": {"pixels": 1, "removed": {}}, "rejected_adapter": None,
+        "recipe": {"lr": 1e-3, "hold": 0.5, "steps": 60}, "scale": {"value": 2.0, "source": "you", "spread": 0.1},
+        "verdict": {"outcome": "frozen", "reason": "r", "frozen": scores, "trials": [trial, trial], "chosen": 1},
+        "refinement": {
+            "accepted": True, "reason": "r", "lacking": "fit", "probability": 0.9, "before": scores,
+            "after": {**scores, "depth_agreement": 0.1},
+        },
+        "known_cameras": {
+            "source": "c", "poses": 2, "intrinsics": 2, "scale": 1.0, "rotation_deg": 1.0, "position": 0.1,
+            "measured": {"points": 3, "factor": 1.0},
+        },
+        "sequence": {
+            "chunks": [{"number": n, "piece": 0, "first": n, "last": n} for n in range(2)], "seams": [seam],
+            "pieces": [{"folder": place, "first": 0, "last": 1, "frames": 2, "ranges": [[0, 1]]} for place in "ab"],
+            "loops": [{"first": 0, "second": 1, "used": False, "similarity": 0.5, "matches": 9}],
+            "frames": 2, "chunk": 1, "overlap": 0, "order": "given",
+        },
+    }  # fmt: skip
+    files.write_json(path, {**json.loads(path.read_text()), **more})
+    return path
+
+
+def _demo(file: Path) -> None:
+    with contextlib.redirect_stdout(io.StringIO()):
+        demo.report(demo.read_scores(file), "lowtex")
+
+
+def _batch(folder: Path) -> Path:
+    rows = [
+        SceneRow(name=name, outcome="adapted", source=["a.jpg"], views=2, seconds=1.0, warnings=0, report="r", log="l")
+        for name in "ab"
+    ]
+    folder.mkdir(parents=True)
+    files.write_json(folder / "batch.json", {"scenes": [asdict(row) for row in rows]})
+    return folder / "batch.json"
+
+
+def _use_batch(file: Path) -> None:
+    write_overview(file.parent, "index.html", list(stored_rows(file).values()))
+
+
+def _log(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    terms = ("translation", "points", "matching", "depth", "field_of_view", "rotation", "zero_motion")
+    scores = ("auc30", "auc15", "auc05", "rotation_deg", "translation_deg", "fov_deg")
+    lines = [{"kind": "step", "views": views, **dict.fromkeys(terms, 0.5)} for views in (1, 2)]
+    lines.append({"kind": "evaluation", "views": 2, **{mode: dict.fromkeys(scores, 0.5) for mode in ("4", "8->4")}})
+    (folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return folder / "log.jsonl"
 
 
 def _report(*undamaged: str) -> Callable[[Path], None]:
@@ -318,14 +382,14 @@ def _dataset(name: str, scene: str, place: str) -> Reader:
     return Reader(f"{name} {Path(place).suffix[1:]} {Path(place).stem[:8]}", write, read)
 
 
-def _photo(suffix: str, **options: object) -> Reader:
+def _photo(suffix: str) -> Reader:
     def write(folder: Path) -> Path:
         folder.mkdir(parents=True)
         pixels = np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8)
         image = Image.fromarray(pixels)
         exif = image.getexif()
         exif[0x0112] = 6
-        image.save(folder / f"photo{suffix}", exif=exif, **options)
+        image.save(folder / f"photo{suffix}", exif=exif)
         return folder / f"photo{suffix}"
 
     return Reader(f"photo {suffix}", write, lambda file: load_photos([file])[0].read())
@@ -346,19 +410,73 @@ def _video(folder: Path) -> Path:
     return folder / "v.mp4"
 
 
+def _deep_photo(folder: Path) -> Path:
+    import cv2
+
+    folder.mkdir(parents=True)
+    pixels = np.random.default_rng(0).integers(0, 65_535, (12, 16, 3), dtype=np.uint16)
+    cv2.imwrite(str(folder / "deep.png"), pixels)
+    return folder / "deep.png"
+
+
+def _mask(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    Image.fromarray(np.eye(12, 16, dtype=np.uint8) * 255).save(folder / "0.png")
+    return folder / "0.png"
+
+
+PHOTOS = tuple(MemoryPhoto(f"{n}.png", np.zeros((12, 16, 3), np.uint8)) for n in range(3))
+
+
+def _use_cameras(path: Path) -> None:
+    read_camera_file(path)
+    read_cameras(path, PHOTOS)
+
+
 def _camera_file(name: str, content: str) -> Reader:
     def write(folder: Path) -> Path:
         folder.mkdir(parents=True)
         (folder / name).write_text(content)
         return folder / name
 
-    return Reader(f"cameras {name}", write, read_camera_file)
+    return Reader(f"cameras {name}", write, _use_cameras)
 
 
-MATRICES = [[[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]] for x in (0.0, 1.0)]
+def _colmap(name: str) -> Reader:
+    """A model with a camera of one kind, and two points in each image; as text where the name says so."""
+
+    def write(folder: Path) -> Path:
+        folder.mkdir(parents=True)
+        params, pose = (10.0, 11.0, 8.0, 6.0, 0.1, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+        if name.endswith(".txt"):
+            (folder / "cameras.txt").write_text(f"# c\n1 OPENCV 16 12 {' '.join(map(str, params))}\n")
+            lines = [f"{n + 1} 1 0 0 0 {n} 0 0 1 {n}.png\n1 2 -1 3 4 -1\n" for n in range(3)]
+            (folder / "images.txt").write_text("# i\n" + "".join(lines))
+        else:
+            camera = struct.pack("<iiQQ8d", 1, 4, 16, 12, *params)
+            (folder / "cameras.bin").write_bytes(struct.pack("<Q", 1) + camera)
+            points = struct.pack("<Qddqddq", 2, 1, 2, -1, 3, 4, -1)
+            images = [struct.pack("<i7di", n + 1, *pose, n, 0, 0, 1) + b"%d.png\0" % n + points for n in range(3)]
+            (folder / "images.bin").write_bytes(struct.pack("<Q", 3) + b"".join(images))
+        return folder / name
+
+    return Reader(f"cameras {name}", write, lambda file: _use_cameras(file.parent))
+
+
+MATRICES = [[[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]] for x in range(3)]
 TRANSFORMS = {
     "w": 16, "h": 12, "fl_x": 10.0, "fl_y": 10.0, "cx": 8.0, "cy": 6.0, "camera_model": "OPENCV", "k1": 0.0,
-    "frames": [{"file_path": f"{n}.png", "transform_matrix": matrix} for n, matrix in zip("ab", MATRICES, strict=True)],
+    "frames": [{"file_path": f"{n}.png", "transform_matrix": matrix} for n, matrix in enumerate(MATRICES)],
+}  # fmt: skip
+PLAIN = {
+    "metric": True,
+    "frames": [
+        {
+            "name": f"{n}.png", "width": 16, "height": 12, "K": [[10.0, 0, 8], [0, 10, 6], [0, 0, 1]], "w2c": matrix,
+            "lens": {"model": "OPENCV", "params": [0.1, 0, 0, 0]}, "image_id": n, "camera_id": 1,
+        }
+        for n, matrix in enumerate(MATRICES)
+    ],
 }  # fmt: skip
 CONFIG = '[run]\nsources = ["photos"]\noutput = "out"\nformats = ["ply"]\nsteps = 50\nadapt = true\n'
 
@@ -376,9 +494,12 @@ READERS = (
     Reader("matches.npz", _matches, _use_matches),
     Reader("reconstruction.json", _of_result("reconstruction.json"), _export),
     Reader("report prediction", _example("prediction.npz"), _report("loss_curve")),
-    Reader("report summary", _example("reconstruction.json"), _report("camera_plan", "loss_curve")),
+    Reader("report summary", _summary, _report("camera_plan", "loss_curve")),
     Reader("report scores", _example("scores.json"), _report("camera_plan", "loss_curve")),
     Reader("report adapter", _example("adapter/freegeo.json"), _report("camera_plan")),
+    Reader("demo scores", _example("scores.json"), _demo),
+    Reader("batch", _batch, _use_batch),
+    Reader("training log", _log, lambda f: read_log(f)),
     Reader("run state", _of_result(files.RUN_FILE), _use_run),
     Reader("bench task", _bench("task.json"), _evaluate),
     Reader("bench scores", _bench("scores.json"), _evaluate),
@@ -408,7 +529,13 @@ READERS = (
     _dataset("scannetpp", "1ada7a0617", "1ada7a0617/merge_dslr_iphone/render_depth/frame_000000.png"),
     _camera_file("transforms.json", json.dumps(TRANSFORMS)),
     _camera_file("tum.txt", "# t x y z q\n" + "".join(f"{t}.0 0 {t} 0 0 0 0 1\n" for t in range(3))),
+    _camera_file("cameras.json", json.dumps(PLAIN)),
+    _camera_file("kitti.txt", "".join(f"1 0 0 {x} 0 1 0 0 0 0 1 0\n" for x in range(3))),
+    _colmap("cameras.bin"), _colmap("images.bin"), _colmap("cameras.txt"), _colmap("images.txt"),
     Reader("config.toml", _config, checked_config),
-    _photo(".png"), _photo(".jpg"), _photo(".tif"), _photo(".webp"),
+    _photo(".png"), _photo(".jpg"), _photo(".tif"), _photo(".webp"), _photo(".avif"), _photo(".jp2"), _photo(".gif"),
+    _photo(".bmp"), _photo(".ppm"),
+    Reader("photo of 16 bits", _deep_photo, lambda file: load_photos([file])[0].read()),
+    Reader("mask", _mask, lambda file: read_masks(file.parent, ["0.jpg"], [SIZE])),
     Reader("video", _video, lambda f: [frame.read() for frame in load_video(f, max_views=4)]),
 )  # fmt: skip

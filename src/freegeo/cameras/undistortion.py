@@ -283,7 +283,7 @@ def require_lens(lens: Lens) -> None:
     """Raise UserError for a lens that cannot be undistorted, or whose numbers are too many, too few or not finite."""
     if lens.model not in LENSES:
         raise UserError(
-            f"cameras of the model {lens.model} cannot be undistorted; known are {', '.join(LENSES)} and pinholes. "
+            f"cameras of the model {lens.model:.40} cannot be undistorted; known are {', '.join(LENSES)} and pinholes. "
             "Undistort the photos elsewhere, and give the cameras of the undistorted ones."
         )
     if len(lens.params) != LENSES[lens.model] or not np.isfinite(lens.params).all():

@@ -239,7 +239,7 @@ class _Table:
         from freegeo.report.overview import SceneRow
 
         self.out, self.works = out, works
-        self.rows = _stored_rows(out / RECORD_NAME)
+        self.rows = stored_rows(out / RECORD_NAME)
         self.skipped = {work.scene.name for work in works if self._is_done(work)}
         self.waiting = [work for work in works if work.scene.name not in self.skipped]
         self.begun: set[str] = set()
@@ -365,7 +365,7 @@ class _Table:
         )  # fmt: skip
 
 
-def _stored_rows(path: Path) -> dict[str, SceneRow]:
+def stored_rows(path: Path) -> dict[str, SceneRow]:
     """Read what an earlier batch wrote about its scenes, by their names; DamagedError when it is not that."""
     from freegeo.report.overview import Batch, SceneRow
 

@@ -12,6 +12,7 @@ from freegeo.cli import console
 from freegeo.cli.jobs import run_job
 from freegeo.cli.options import DemoModelOptions, OutputOptions, RecipeOptions
 from freegeo.cli.sources import DEMO_DOMAIN, demo_scene
+from freegeo.errors import DamagedError
 from freegeo.export.photos import write_copies
 from freegeo.files import read_json, write_json
 
@@ -64,7 +65,22 @@ def demo(
         scene.photos, model, target, command="demo", recipe=recipe, guard="report", extra_settings=extra,
         after=add_scores,
     )  # fmt: skip
-    report(read_json(output / SCORES_NAME), domain)
+    report(read_scores(output / SCORES_NAME), domain)
+
+
+def read_scores(path: Path) -> dict[str, Any]:
+    """Read what `score_windows` gave an earlier command; DamagedError when a score is missing."""
+    from freegeo.metrics.scene import PRINTED
+    from freegeo.report.schema import DemoScores
+
+    advice = "Run again with --overwrite."
+    scores = read_json(path, DemoScores, advice=advice) if path.is_file() else {}
+    for name in ("frozen", "adapted"):
+        for views in map(str, VIEWS):
+            for key in PRINTED:
+                if key not in scores.get(name, {}).get(views, {}):
+                    raise DamagedError(path, f"{key} of {name} with {views} views is missing", advice)
+    return scores
 
 
 def true_reconstruction(job: Job, scene: Scene) -> Reconstruction:

@@ -9,7 +9,7 @@ from typing import BinaryIO
 import numpy as np
 import torch
 
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import FreeGeoError, UserError, in_short
 from freegeo.geometry.rotation import quat_wxyz_to_xyzw, quat_xyzw_to_matrix
 
 _MODELS = (  # name and number of parameters, at the position that is COLMAP's number of the model
@@ -95,7 +95,7 @@ def _parse(path: Path, reader):
     try:
         return reader(path)
     except (struct.error, ValueError, IndexError, KeyError) as error:
-        raise FreeGeoError(f"{path} is not a readable COLMAP file ({error}).") from error
+        raise FreeGeoError(f"{path} is not a readable COLMAP file ({in_short(error)}).") from error
 
 
 def _text_cameras(path: Path) -> list[ColmapCamera]:

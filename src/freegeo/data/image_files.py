@@ -31,6 +31,8 @@ MAX_PIXELS = 150_000_000
 
 _DARK, _BRIGHT, _FLAT = 0.04, 0.97, 0.02
 """Mean brightness below and above which, and range of brightness below which, an image is blank."""
+_HEAD = 30
+"""Bytes at the beginning of a file that are looked at; those of a WebP with its size."""
 _HEIF_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 _ORIENTATION_TAG, _SIDEWAYS = 0x0112, (5, 6, 7, 8)
 _SIXTEEN_BITS, _FLOAT_SLACK = 65_535, 0.01
@@ -63,6 +65,9 @@ def opened(path: Path) -> Generator[PillowImage]:
     from PIL import Image, UnidentifiedImageError
 
     formats = _formats(path)
+    width, height = _size_of_animation(path)
+    if width * height > MAX_PIXELS:
+        raise _too_large(path, f"{width} x {height} pixels are")
     try:
         with pillow_limit_off():
             image = Image.open(path, formats=formats)
@@ -73,7 +78,7 @@ def opened(path: Path) -> Generator[PillowImage]:
         raise UnreadableImageError(path, reason) from None
     except Image.DecompressionBombError:
         raise _too_large(path, "its pixels are") from None
-    except _DECODER_ERRORS as error:
+    except (*_DECODER_ERRORS, MemoryError) as error:
         raise _damaged(path, error) from None
     with image:
         if image.width * image.height > MAX_PIXELS:
@@ -119,13 +124,28 @@ def _formats(path: Path) -> tuple[str, ...]:
 
 
 def _is_heif(path: Path) -> bool:
+    head = _head(path)
+    return head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS
+
+
+def _size_of_animation(path: Path) -> tuple[int, int]:
+    """Return width and height of a WebP that may hold several pictures, for which Pillow makes room when it opens it.
+
+    (0, 0) for all other files.
+    """
+    head = _head(path)
+    if (head[:4], head[8:16]) != (b"RIFF", b"WEBPVP8X") or len(head) < _HEAD:
+        return 0, 0
+    return int.from_bytes(head[24:27], "little") + 1, int.from_bytes(head[27:30], "little") + 1
+
+
+def _head(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            head = file.read(12)
+            return file.read(_HEAD)
     except OSError as error:
         _require_no_shortage(error)
         raise UnreadableImageError(path, f"the file cannot be opened ({error.strerror})") from None
-    return head[4:8] == b"ftyp" and head[8:] in _HEIF_BRANDS
 
 
 def _too_large(path: Path, what: str) -> UnreadableImageError:
@@ -304,7 +324,8 @@ def rgb_on_white(image: PillowImage) -> np.ndarray:
     if "A" in image.getbands() or "transparency" in image.info:
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-    return np.array(image.convert("RGB"))
+    # A copy of a large image would take half a gigabyte.
+    return np.array(image if image.mode == "RGB" else image.convert("RGB"))
 
 
 def _load(image: PillowImage, path: Path | str) -> None:

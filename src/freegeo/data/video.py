@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from freegeo.data.image_files import is_blank
+from freegeo.data.image_files import MAX_PIXELS, is_blank
 from freegeo.errors import FreeGeoError, UserError
 
 logger = logging.getLogger(__name__)
@@ -372,6 +372,16 @@ def _opened(path: Path) -> Generator[Any]:
     with container:
         if not container.streams.video:
             raise UserError(f"{path}: holds no video stream. Give a video, or a folder of photos.")
+        codec = container.streams.video[0].codec_context
+        if codec is None:
+            raise UserError(f"{path}: its codec is not known. Convert it, or give a folder of photos.")
+        if codec.width * codec.height > MAX_PIXELS:
+            raise UserError(
+                f"{path}: frames of {codec.width} x {codec.height} pixels are more than the limit of "
+                f"{MAX_PIXELS // 1_000_000} megapixels. Convert it."
+            )
+        # A frame may have another size than the file says at its beginning.
+        codec.options = {"max_pixels": str(MAX_PIXELS)}
         aspect = _pixel_aspect(container)
         if not 1 / _EXTREME_ASPECT <= aspect <= _EXTREME_ASPECT:
             raise UserError(f"{path}: its pixels are {aspect:.3g} times as wide as high by its header. Convert it.")

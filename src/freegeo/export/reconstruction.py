@@ -47,6 +47,8 @@ _CAMERAS = ("T_cam_world", "K")
 _VIEWS = (-1, -1, -1)
 _ROTATION_SLACK = 0.01
 """Largest entry of R R^T - 1 in a file; that of float32 rotations is a thousand times smaller."""
+_SMALLEST_FOCAL = 1e-3
+"""In pixels, below which a number in a file is no focal length."""
 _KINDS: dict[str, files.Kind] = {
     "depth_z": ("f", _VIEWS), "conf": ("f", _VIEWS), "images": ("u", (-1, -1, -1, 3)), "names": ("U", (-1,)),
     "photo_hw": ("iu", (-1, 2)), "scale_xy": ("f", (-1, 2)), "offset_xy": ("f", (-1, 2)),
@@ -366,7 +368,8 @@ class Reconstruction:
                 checks["T_cam_world"] = np.isfinite(self.T_cam_world).all((1, 2)) & (square < _ROTATION_SLACK)
             if self.K is not None:
                 focal = np.minimum(self.K[:, 0, 0], self.K[:, 1, 1])
-                checks["K"] = np.isfinite(self.K).all((1, 2)) & (focal > 0)
+                below = (self.K[:, 1, 0] == 0) & (self.K[:, 2] == (0, 0, 1)).all(1)
+                checks["K"] = np.isfinite(self.K).all((1, 2)) & (focal > _SMALLEST_FOCAL) & below
         return checks
 
 

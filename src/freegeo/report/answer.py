@@ -104,7 +104,7 @@ def _refinement(summary: Mapping[str, Any]) -> Iterator[Part]:
     if told:
         more = " The cameras stay as they were predicted."
         if told["accepted"]:
-            more, (before, after) = "", (_excess(told[key]) for key in ("before", "after"))
+            more, (before, after) = "", (_excess(told.get(key) or {}) for key in ("before", "after"))
             if before is not None and after is not None and after > before + WORSE:
                 own, frozen = (1 - told["after"][key] for key in ("depth_agreement", "depth_agreement_frozen"))
                 shares = f"{100 * own:.0f} % of the pixels (frozen: {100 * frozen:.0f} % of the same ones)"
@@ -138,7 +138,7 @@ def _rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     rows = [("frozen", frozen, not is_adapted), *adapted]
     rows = [(name, scores, used and not refined) for name, scores, used in rows]
     if told.get("after"):
-        surely = {"probability": told["probability"]}
+        surely = {"probability": told.get("probability")}
         rows.append(("refined" if refined else "refined, refused", {**told["after"], **surely}, refined))
     for name, scores, used in rows:
         if scores and scores.get("epipolar_px") is not None:

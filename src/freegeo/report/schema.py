@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NotRequired, Required, TypedDict
+from typing import Annotated, Any, Literal, Required, TypedDict
+
+from msgspec import Meta
 
 from freegeo.files import read_json
 
@@ -24,11 +26,17 @@ class Loss(TypedDict):
     last: float
 
 
-class Trial(TypedDict):
-    """A state of the adapter that was judged; its scores are beside these fields."""
+class Trial(TypedDict, total=False):
+    """A state of the adapter that was judged, with its scores as far as they are shown."""
 
-    steps: float
-    strength: float
+    steps: Required[float]
+    strength: Required[float]
+    epipolar_px: float | None
+    reprojection_px: float | None
+    depth_agreement: float | None
+    depth_agreement_frozen: float | None
+    matches: float | None
+    probability: float | None
 
 
 class Verdict(TypedDict, total=False):
@@ -44,60 +52,91 @@ class Verdict(TypedDict, total=False):
 class Refinement(TypedDict, total=False):
     """What refinement made of the prediction."""
 
-    accepted: bool
-    reason: str
-    lacking: str | None
+    accepted: Required[bool]
+    reason: Required[str]
+    lacking: Literal["matches", "fit", "proof"] | None
     probability: float | None
     frozen: Scores | None
     before: Scores | None
     after: Scores | None
 
 
-class Known(TypedDict):
-    """How many cameras were known."""
+class Measured(TypedDict):
+    """What matches measured with known cameras."""
 
-    poses: int
-    intrinsics: int
-    given: NotRequired[int]
+    points: int
+    factor: float
+
+
+class Known(TypedDict, total=False):
+    """What known cameras made of the prediction."""
+
+    source: Required[str]
+    poses: Required[int]
+    intrinsics: Required[int]
+    given: int
     """Of a sequence: known poses of all its photos. The next ones are of the same kind, and of this piece."""
-    odd: NotRequired[list[str]]
-    chunks: NotRequired[int]
-    untied: NotRequired[int]
-    rotation_deg: NotRequired[float | None]
-    position: NotRequired[float | None]
+    odd: list[str]
+    chunks: int
+    untied: int
+    scale: float | None
+    rotation_deg: float | None
+    position: float | None
+    measured: Measured | None
 
 
-class RecipeFacts(TypedDict):
+class ScaleRecord(TypedDict, total=False):
+    """What lengths in metres rest on."""
+
+    value: Required[float]
+    source: Required[str]
+    spread: float | None
+
+
+class RecipeFacts(TypedDict, total=False):
     """What the advice mentions of a recipe."""
 
-    lr: float
-    hold: float
+    lr: Required[float]
+    hold: Required[float]
+    steps: int | None
 
 
-class ChunkRecord(TypedDict):
+class ChunkRecord(TypedDict, total=False):
     """A chunk of a sequence."""
 
-    number: int
-    piece: int | None
-    first: int
-    last: int
+    number: Required[int]
+    piece: Required[int | None]
+    first: Required[int]
+    last: Required[int]
+    refined: bool | None
+    reason: str | None
+    """Why it has no result."""
 
 
-class Seam(TypedDict):
+class Seam(TypedDict, total=False):
     """A seam between two chunks."""
 
-    first: int
-    second: int
-    kind: str
-    used: bool
+    first: Required[int]
+    second: Required[int]
+    kind: Required[str]
+    used: Required[bool]
+    frames: Required[int]
+    inliers: float | None
+    rms: float | None
+    scale: float | None
+    gap: float | None
+    reason: str | None
 
 
-class Loop(TypedDict):
+class Loop(TypedDict, total=False):
     """Two frames of one place."""
 
-    first: int
-    second: int
-    used: bool
+    first: Required[int]
+    second: Required[int]
+    used: Required[bool]
+    similarity: float | None
+    matches: int | None
+    reason: str | None
 
 
 class Together(TypedDict):
@@ -110,7 +149,10 @@ class PieceRecord(TypedDict, total=False):
     """A part of a sequence that was joined."""
 
     folder: Required[str]
-    ranges: list[list[int]]
+    first: Required[int]
+    last: Required[int]
+    frames: Required[int]
+    ranges: list[tuple[int, int]]
     """First and last frame of each run of frames that the piece has."""
     together: Together | None
     """What became of the bundle adjustment of all its photos."""
@@ -119,8 +161,12 @@ class PieceRecord(TypedDict, total=False):
 class SequenceRecord(TypedDict):
     """How a long sequence was joined."""
 
+    frames: int
+    chunk: int
+    overlap: int
+    order: str
     chunks: list[ChunkRecord]
-    pieces: list[PieceRecord]
+    pieces: Annotated[list[PieceRecord], Meta(min_length=1)]
     seams: list[Seam]
     loops: list[Loop]
 
@@ -141,6 +187,9 @@ class Summary(TypedDict, total=False):
     rejected_adapter: str | None
     refinement: Refinement | None
     known_cameras: Known | None
+    scale: ScaleRecord | None
+    licence_of_weights: str | None
+    image_hw: tuple[int, int] | None
     recipe: RecipeFacts | None
     sequence: SequenceRecord | None
 

@@ -109,9 +109,10 @@ def frames_of(result: Result) -> list[int] | None:
     sequence = result.summary.get("sequence")
     if not sequence:
         return None
-    piece = sequence["pieces"][_piece_number(result.folder, sequence)]
-    frames = [frame for first, last in piece.get("ranges", ()) for frame in range(first, last + 1)]
-    return frames if len(frames) == len(result.names) else None
+    ranges = sequence["pieces"][_piece_number(result.folder, sequence)].get("ranges", ())
+    if sum(last - first + 1 for first, last in ranges) != len(result.names):
+        return None
+    return [frame for first, last in ranges for frame in range(first, last + 1)]
 
 
 def view_numbers(result: Result) -> list[str]:
@@ -204,7 +205,7 @@ def _seam_sentence(sequence: Mapping[str, Any]) -> str:
     if not unused:
         return f"{len(seams)} seams between neighbours, all used." if len(seams) > 1 else "1 seam, used."
     piece_of = {chunk["number"]: chunk["piece"] for chunk in sequence["chunks"]}
-    bridged = sum(piece_of[seam["first"]] == piece_of[seam["second"]] for seam in unused)
+    bridged = sum(piece_of.get(seam["first"]) == piece_of.get(seam["second"]) for seam in unused)
     more = f"; {bridged} of them {'is' if bridged == 1 else 'are'} bridged by others" if bridged else ""
     return f"{len(unused)} of {_count(len(seams), 'seam')} between neighbours could not be used{more}."
 
@@ -214,7 +215,7 @@ def _problems(sequence: Mapping[str, Any]) -> list[str]:
     piece_of = {chunk["number"]: chunk["piece"] for chunk in sequence["chunks"]}
     frames_of = {c["number"]: f"frames {c['first']} to {c['last']}" for c in sequence["chunks"]}
     found = [
-        f"Chunk {chunk['number']} ({frames_of[chunk['number']]}) is missing{_because(chunk['reason'])}"
+        f"Chunk {chunk['number']} ({frames_of[chunk['number']]}) is missing{_because(chunk.get('reason'))}"
         for chunk in sequence["chunks"]
         if chunk["piece"] is None and not _is_spare(chunk, sequence)
     ]
@@ -223,7 +224,7 @@ def _problems(sequence: Mapping[str, Any]) -> list[str]:
     for a, b in sorted({*neighbours, *(pair for pair, seam in seam_of.items() if not seam["used"])}):
         ends, seam = (piece_of.get(a), piece_of.get(b)), seam_of.get((a, b))
         if None not in ends and ends[0] != ends[1]:
-            why = _because("they share no frames." if seam is None else seam["reason"])
+            why = _because("they share no frames." if seam is None else seam.get("reason"))
             found.append(f"Chunks {a} and {b} ({frames_of[a]}, and {frames_of[b]}) could not be joined{why}")
     if len(found) > MOST_NAMED:
         found[MOST_NAMED:] = [f"So it is at {len(found) - MOST_NAMED} more places; see the seams below."]

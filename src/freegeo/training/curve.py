@@ -2,23 +2,61 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from freegeo.errors import UserError
-from freegeo.files import atomic_path
+from freegeo.files import atomic_path, json_of, read_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+class _Line(TypedDict):
+    kind: str
+    views: float
+
+
+class _Step(_Line):
+    translation: float
+    points: float
+    matching: float
+    depth: float
+    field_of_view: float
+    rotation: float
+    zero_motion: float
+
+
+class _Scores(TypedDict):
+    auc30: float
+    auc15: float
+    auc05: float
+    rotation_deg: float
+    translation_deg: float
+    fov_deg: float
+
+
+_Modes = TypedDict("_Modes", {"4": _Scores, "8->4": _Scores})
+
+
+class _Evaluation(_Line, _Modes):
+    pass
+
+
+_KINDS = {"step": _Step, "evaluation": _Evaluation}
+
+
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """Return a log's lines, those that a resumed run repeated only once. UserError when there is no log."""
+    """Return a log's lines, those that a resumed run repeated only once.
+
+    UserError when there is no log, DamagedError when it is damaged.
+    """
     if not path.is_file():
         raise UserError(f"{path}: no such training log. Give the log.jsonl of a training run.")
     kept: list[dict[str, Any]] = []
-    for line in map(json.loads, path.read_text(encoding="utf-8").splitlines()):
+    for text in read_text(path).splitlines():
+        line = json_of(text, path, _Line)
+        json_of(text, path, _KINDS.get(line["kind"], _Line))
         kept = [other for other in kept if other["kind"] != line["kind"] or other["views"] < line["views"]]
         kept.append(line)
     return kept
@@ -43,7 +81,7 @@ def plot_learning_curve(log: Path, figure: Path) -> Path:
         axes[0, 0].plot(seen, [line[name] for line in steps], label=name.replace("_", " "))
     axes[0, 0].set(title="Weighted losses (running means)", yscale="log")
     axes[0, 0].legend(fontsize=8)
-    axes[0, 1].plot(seen, [line["rotation"] / line["zero_motion"] for line in steps], color="black")
+    axes[0, 1].plot(seen, [line["rotation"] / (line["zero_motion"] or float("nan")) for line in steps], color="black")
     axes[0, 1].axhline(1, linestyle=":", color="grey")
     axes[0, 1].set(title="Rotation loss / that of cameras that stand still", ylim=(0, 1.1))
     if scores:

@@ -305,7 +305,7 @@ def keep_settings(config: TrainConfig, folder: Path) -> None:
     settings = as_json(asdict(config))
     path = folder / CONFIG
     if path.is_file():
-        before = read_json(path)
+        before = read_json(path, dict[str, Any])
         may_grow = not config.minutes and config.views >= before.get("views", config.views)
         names = sorted({*settings, *before} - ({"views"} if may_grow else set()))
         different = [name for name in names if settings.get(name) != before.get(name)]
