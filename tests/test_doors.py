@@ -15,9 +15,12 @@ import torch
 from safetensors.torch import save_file
 
 from freegeo import files, host
-from freegeo.cli.app import main, out_of_memory
-from freegeo.errors import DamagedError, FreeGeoError
+from freegeo.cli.app import checked_config, main, out_of_memory
+from freegeo.cli.demo import read_scores
+from freegeo.errors import DamagedError, FreeGeoError, UserError
+from freegeo.metrics.scene import PRINTED
 from freegeo.models import catalog
+from freegeo.training.curve import read_log
 
 FULL = Path("/dev/full")
 
@@ -77,6 +80,43 @@ def test_json_is_checked_and_keeps_fields_that_nobody_named(tmp_path):
         path.write_bytes(text.encode("latin-1"))
         with pytest.raises(DamagedError, match=r"a\.json: damaged file"):
             files.read_json(path, dict[str, list[int]])
+
+
+@pytest.mark.parametrize("text", ["9" * 400, "[" * 100_000, '{"a": ' + "9" * 5_000 + "}"], ids=["400", "deep", "5000"])
+def test_json_that_nothing_can_compute_with_is_damaged(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(DamagedError):
+        files.read_json(tmp_path / "a.json")
+    assert files.json_value("9" * 300) == int("9" * 300)
+
+
+@pytest.mark.parametrize("text", ["a = " + "[" * 5_000, "a = " + "9" * 5_000], ids=["deep", "5000"])
+def test_a_config_file_that_nothing_can_read_is_named(tmp_path, text):
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(UserError, match="not a TOML file"):
+        checked_config(tmp_path / "a.toml")
+
+
+SCORES = {name: {views: dict.fromkeys(PRINTED, 0.5) for views in ("4", "8")} for name in ("frozen", "adapted")}
+
+
+@pytest.mark.parametrize(
+    "content", [None, [], {"frozen": 1}, {**SCORES, "adapted": {}}, {**SCORES, "frozen": {"4": {"auc30": None}}}], ids=str
+)
+def test_scores_of_a_demo_that_are_damaged_or_gone(tmp_path, content):
+    path = tmp_path / "scores.json"
+    files.write_json(path, SCORES)
+    assert read_scores(path) == SCORES
+    path.unlink() if content is None else files.write_json(path, content)
+    with pytest.raises(DamagedError, match=r"Run again with --overwrite\."):
+        read_scores(path)
+
+
+@pytest.mark.parametrize("line", ["{", "[]", '{"kind": "step", "views": 1}', '{"kind": "evaluation", "views": 1, "4": 2}'])
+def test_a_damaged_training_log_is_named(tmp_path, line):
+    (tmp_path / "log.jsonl").write_text('{"kind": "other", "views": 1}\n' + line + "\n")
+    with pytest.raises(DamagedError, match=r"log\.jsonl: damaged file"):
+        read_log(tmp_path / "log.jsonl")
 
 
 def test_tensors_on_a_full_disk_end_as_other_files_do(tmp_path, monkeypatch):

@@ -243,6 +243,16 @@ def test_no_folder_at_all(tmp_path):
     refused(tiny_da3(), tmp_path / "nowhere", "not an adapter folder")
 
 
+@pytest.mark.parametrize("rank", [1, 1 << 40])
+def test_a_rank_that_is_not_that_of_the_matrices_is_refused_before_there_is_room_for_it(tmp_path, rank):
+    model = tiny_da3()
+    save_adapter(trained(model), tmp_path, METADATA)
+    config = json.loads((tmp_path / "adapter_config.json").read_text())
+    (tmp_path / "adapter_config.json").write_text(json.dumps({**config, "r": rank}))
+    with pytest.raises(UserError, match=f"not of the rank {rank} that"):
+        load_adapter(tiny_da3(), tmp_path)
+
+
 def test_damaged_files_are_named(tmp_path):
     saved(tiny_da3, tmp_path / "short")
     weights = tmp_path / "short" / "adapter_model.safetensors"

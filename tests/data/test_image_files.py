@@ -3,9 +3,11 @@
 import errno
 import io
 import os
+import resource
 import shutil
 import struct
 import subprocess
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,6 +20,7 @@ from freegeo.data.image_files import FORMATS, UnreadableImageError, is_blank
 from freegeo.data.masks import load_masks
 from freegeo.data.photos import load_photos, open_photos
 from freegeo.errors import UserError
+from png_header import png_header
 
 
 def read(path) -> np.ndarray:
@@ -283,6 +286,50 @@ def test_other_formats_are_refused_whatever_they_are_called(tmp_path, monkeypatc
             load_photos(file)
         with pytest.raises(UnreadableImageError):
             read_gray(file)
-        with pytest.raises(UserError, match="have no mask"):
+        with pytest.raises(UserError, match="not a readable image" if suffix else "have no mask"):
             load_masks(file.parent, ["a.jpg"], [(64, 64)])
         shutil.rmtree(file.parent)
+
+
+# -- files that announce more than they hold
+
+
+def announced(kind: str, side: int) -> bytes:
+    """Return a small file that says it has so many pixels a side."""
+    if kind == "PNG":
+        return png_header(side, side)
+    out = io.BytesIO()
+    frame = Image.fromarray(np.arange(256, dtype=np.uint8).reshape(16, 16)).convert("RGB")
+    frame.save(out, kind, **({"save_all": True, "append_images": [frame.rotate(90)]} if kind == "WEBP" else {}))
+    content, size = bytearray(out.getvalue()), struct.pack(">HH", side, side)
+    if kind == "JPEG":
+        start = content.index(b"\xff\xc0") + 5
+        content[start : start + 4] = size
+    elif kind == "WEBP":
+        content[24:30] = 2 * (side - 1).to_bytes(3, "little")
+    else:
+        # Width and length of a TIFF are the first two entries of its table.
+        table = content.index(struct.pack("<HHI", 256, 4, 1))
+        content[table + 8 : table + 12] = content[table + 20 : table + 24] = struct.pack("<I", side)
+    return bytes(content)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "TIFF", "WEBP"])
+@pytest.mark.parametrize("door", ["photo", "mask", "map"])
+def test_an_image_that_announces_too_many_pixels_is_refused_before_there_is_room_for_them(tmp_path, kind, door):
+    path = tmp_path / f"a.{kind.lower()}"
+    path.write_bytes(announced(kind, 60_000))
+    read = {
+        "photo": lambda: load_photos([path])[0].read(),
+        "mask": lambda: load_masks(tmp_path, ["a.jpg"], [(16, 16)]),
+        "map": lambda: read_gray(path),
+    }[door]
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + (1 << 30), before[1]))
+    try:
+        with pytest.raises(UserError) as refused:
+            read()
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+    assert "more than the limit of 150 megapixels" in str(refused.value)

@@ -243,8 +243,11 @@ def test_a_mask_is_turned_as_its_own_exif_says(tmp_path):
 
 @pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n broken"])
 def test_files_that_are_no_images_are_no_masks(tmp_path, content):
-    (tmp_path / "a.png").write_bytes(content)
+    # What is called an image was meant to be one; other files lie beside masks.
+    (tmp_path / "a").write_bytes(content)
     assert "have no mask" in refusal(tmp_path, ["a.jpg"])
+    (tmp_path / "a.png").write_bytes(content)
+    assert "a.png: the file is not a readable image" in refusal(tmp_path, ["a.jpg"])
 
 
 def test_a_truncated_mask_is_refused(tmp_path):

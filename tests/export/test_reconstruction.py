@@ -50,6 +50,23 @@ def test_a_saved_reconstruction_comes_back_bit_for_bit(tmp_path):
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["prediction.npz"]
 
 
+@pytest.mark.parametrize(
+    ("name", "place", "value"),
+    [
+        ("K", (1, 0, 0), 0), ("K", (1, 2, 2), 0), ("K", (1, 1, 1), np.nan), ("T_cam_world", (1, 0, 0), 2),
+        ("T_cam_world", (1, 0, 3), np.inf),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_cameras_that_none_can_be_are_refused_with_their_view(tmp_path, name, place, value):
+    file = Reconstruction.from_prediction(prediction_of(), batch_of()).save(tmp_path)
+    arrays = dict(np.load(file))
+    arrays[name][place] = value
+    np.savez(file, **arrays)
+    with pytest.raises(FreeGeoError, match=f"damaged, {name} of 'ü1.jpg' is not that of a camera"):
+        Reconstruction.load(file)
+
+
 def test_the_file_holds_what_its_description_says(tmp_path):
     prediction, batch = prediction_of(), batch_of()
     file = Reconstruction.from_prediction(prediction, batch).save(tmp_path / "scene.npz")

@@ -27,6 +27,12 @@ def pieces(folders):
     return [load_result(folder) for folder in folders]
 
 
+def test_ranges_of_more_frames_than_there_are_views_are_not_counted(pieces):
+    told = dict(pieces[0].summary["sequence"])
+    told["pieces"] = [{**piece, "ranges": [(0, 10**15)]} for piece in told["pieces"]]
+    assert sequence.frames_of(replace(pieces[0], summary={"sequence": told})) is None
+
+
 def test_every_view_is_called_by_its_frame(pieces):
     step = CHUNK - OVERLAP
     assert sequence.frames_of(pieces[0]) == list(range((CUT - 1) * step + CHUNK))

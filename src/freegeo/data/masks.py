@@ -10,7 +10,7 @@ from pathlib import Path, PurePath
 
 import numpy as np
 
-from freegeo.data.image_files import deep_values, is_image, opened, rgba_pixels, scaled
+from freegeo.data.image_files import IMAGE_SUFFIXES, deep_values, is_image, opened, rgba_pixels, scaled
 from freegeo.data.photos import natural_key, some_of
 from freegeo.errors import UserError
 
@@ -43,7 +43,7 @@ def load_masks(
 
     Raises:
         UserError: no such folder, a photo without a mask or with several, a mask for several photos, an image that is
-            not black and white, of another shape than the photo, or masks that select nothing.
+            damaged or too large, or not black and white, of another shape than the photo, or masks that select nothing.
     """
     folder = folder.expanduser()
     if not folder.is_dir():
@@ -77,7 +77,7 @@ def _warn_of_empty_and_full(folder: Path, names: Sequence[str], masks: Sequence[
 
 def _mask_of_each(folder: Path, names: Sequence[str]) -> list[Path]:
     """Return the file of each photo's mask."""
-    files = sorted((path for path in folder.rglob("*") if path.is_file() and is_image(path)), key=natural_key)
+    files = sorted((path for path in folder.rglob("*") if path.is_file() and _is_mask(path)), key=natural_key)
     by_name: dict[str, list[Path]] = defaultdict(list)
     for file in files:
         for name in _photo_names(file):
@@ -98,6 +98,14 @@ def _mask_of_each(folder: Path, names: Sequence[str]) -> list[Path]:
             raise UserError(f"{mask}: fits {owners[mask]} and {name}. {_NAMING}, so that each photo has its own.")
         owners[mask] = name
     return list(owners)
+
+
+def _is_mask(path: Path) -> bool:
+    """Whether a file is an image; `UnreadableImageError` for one that is named like an image and cannot be read."""
+    if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith("."):
+        with opened(path):
+            return True
+    return is_image(path)
 
 
 def _photo_names(mask: Path) -> set[str]:
