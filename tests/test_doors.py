@@ -101,7 +101,9 @@ SCORES = {name: {views: dict.fromkeys(PRINTED, 0.5) for views in ("4", "8")} for
 
 
 @pytest.mark.parametrize(
-    "content", [None, [], {"frozen": 1}, {**SCORES, "adapted": {}}, {**SCORES, "frozen": {"4": {"auc30": None}}}], ids=str
+    "content",
+    [None, [], {"frozen": 1}, {**SCORES, "adapted": {}}, {**SCORES, "frozen": {"4": {"auc30": None}}}],
+    ids=["gone", "list", "number", "missing", "null"],
 )
 def test_scores_of_a_demo_that_are_damaged_or_gone(tmp_path, content):
     path = tmp_path / "scores.json"
@@ -112,7 +114,9 @@ def test_scores_of_a_demo_that_are_damaged_or_gone(tmp_path, content):
         read_scores(path)
 
 
-@pytest.mark.parametrize("line", ["{", "[]", '{"kind": "step", "views": 1}', '{"kind": "evaluation", "views": 1, "4": 2}'])
+@pytest.mark.parametrize(
+    "line", ["{", "[]", '{"kind": "step", "views": 1}', '{"kind": "evaluation", "views": 1, "4": 2}']
+)
 def test_a_damaged_training_log_is_named(tmp_path, line):
     (tmp_path / "log.jsonl").write_text('{"kind": "other", "views": 1}\n' + line + "\n")
     with pytest.raises(DamagedError, match=r"log\.jsonl: damaged file"):

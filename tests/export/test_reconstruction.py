@@ -54,16 +54,17 @@ def test_a_saved_reconstruction_comes_back_bit_for_bit(tmp_path):
     ("name", "place", "value"),
     [
         ("K", (1, 0, 0), 0), ("K", (1, 2, 2), 0), ("K", (1, 1, 1), np.nan), ("T_cam_world", (1, 0, 0), 2),
-        ("T_cam_world", (1, 0, 3), np.inf),
+        ("T_cam_world", (1, 0, 3), np.inf), ("scale_xy", (1, 0), np.nan), ("scale_xy", (1, 0), 0),
+        ("offset_xy", (1, 0), 1e30), ("photo_hw", (1, 0), 1 << 40),
     ],
     ids=str,
 )  # fmt: skip
-def test_cameras_that_none_can_be_are_refused_with_their_view(tmp_path, name, place, value):
+def test_numbers_that_no_photo_has_are_refused_with_its_name(tmp_path, name, place, value):
     file = Reconstruction.from_prediction(prediction_of(), batch_of()).save(tmp_path)
     arrays = dict(np.load(file))
     arrays[name][place] = value
     np.savez(file, **arrays)
-    with pytest.raises(FreeGeoError, match=f"damaged, {name} of 'ü1.jpg' is not that of a camera"):
+    with pytest.raises(FreeGeoError, match=f"damaged, {name} of ü1.jpg is not that of a photo"):
         Reconstruction.load(file)
 
 

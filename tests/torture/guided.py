@@ -1,9 +1,8 @@
 """Damage files by what the readers' code does with them: libFuzzer, through atheris, which is no dependency of freegeo.
 
 `python -m torture.guided READER [SECONDS] [SEED]`, in the folder of the tests and an environment with atheris, prints
-each new fault once, and counts at the end; it ends with code 1 where there was a fault. Half of the mutations are libFuzzer's own, which keeps
-what reaches new lines of freegeo; the others are those of `torture.fuzz`, whose checksums fit. A case may take as long and
-as much memory as there.
+each new fault once, and counts at the end; it ends with code 1 where there was a fault. Half of the mutations are
+libFuzzer's own, which keeps what reaches new lines of freegeo; the others are those of `torture.fuzz`.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from freegeo.adaptation.adapter import Adapter
-from freegeo.errors import DamagedError, UserError
+from freegeo.errors import DamagedError, UserError, in_short
 from freegeo.files import FORMAT, atomic_path, read_json, write_json, write_tensors
 from freegeo.models.checkpoints import read_tensors, require_match, require_sound
 
@@ -47,6 +47,8 @@ STARTS_ON_THE_MODEL = (True, False, None, "gaussian", "orthogonal", "eva", "mica
 """Initialisations of peft that leave the weights of the model as they are."""
 
 
+LARGEST_STRENGTH = 1_000.0
+"""Beyond what anybody chooses; far larger numbers overflow."""
 PLAIN_BIAS = ("bias", "none")
 LORA_SUFFIX, TOKEN_SUFFIX = "_lora_peft", "_lora.pt"
 
@@ -158,8 +160,8 @@ def adapter_metadata(folder: Path) -> dict[str, Any] | None:
     except DamagedError as error:
         advice = "Copy the whole folder that `freegeo adapt` wrote."
         raise UserError(f"{path}: does not describe an adapter ({error.reason}). {advice}") from None
-    if not math.isfinite(metadata.get("strength", 1)):
-        raise UserError(f"{path}: the strength {metadata['strength']} is no number. Copy the whole folder again.")
+    if not abs(metadata.get("strength", 1)) <= LARGEST_STRENGTH:
+        raise UserError(f"{path}: the strength is {metadata['strength']:g}, as none is. Copy the whole folder again.")
     if metadata["format"] > FORMAT:
         raise UserError(f"{folder}: written by a newer freegeo (format {metadata['format']}). Update freegeo.")
     return metadata
@@ -190,11 +192,12 @@ def _require_same_base(model: str, fingerprint: str, metadata: Mapping[str, Any]
         return
     base = metadata["base"]
     if base["model"] != model:
-        raise UserError(f"{folder}: the adapter was made for {base['model']}, not for {model}. Use that model.")
+        made_for = in_short(base["model"])
+        raise UserError(f"{folder}: the adapter was made for {made_for}, not for {model}. Use that model.")
     if base["fingerprint"] and fingerprint and base["fingerprint"] != fingerprint:
         raise UserError(
-            f"{folder}: the adapter was made for another checkpoint of {base['model']} ({base['fingerprint']}, this is "
-            f"{fingerprint}). Use that checkpoint."
+            f"{folder}: the adapter was made for another checkpoint of {model} ({in_short(base['fingerprint'])}, this "
+            f"is {fingerprint}). Use that checkpoint."
         )
 
 
@@ -239,21 +242,22 @@ def read_peft(folder: Path) -> tuple[Mapping[str, Any], dict[str, Tensor]]:
 def _require_plain_lora(config: Any, folder: Path) -> None:
     if not isinstance(config, dict) or config.get("peft_type") != "LORA":
         kind = config.get("peft_type", "different") if isinstance(config, dict) else "different"
-        raise UserError(f"{folder}: holds a {kind} adapter; only LoRA is supported.")
+        raise UserError(f"{folder}: holds a {in_short(kind)} adapter; only LoRA is supported.")
     rank, alpha = config.get("r"), config.get("lora_alpha")
     if type(rank) is not int or rank < 1 or type(alpha) not in (int, float) or not math.isfinite(alpha):
-        raise UserError(f"{folder / CONFIG}: rank {rank} and alpha {alpha} are not those of an adapter. Copy it again.")
+        raise UserError(f"{folder / CONFIG}: rank and alpha are not those of an adapter. Copy it again.")
     start = config.get("init_lora_weights")
     if start not in STARTS_ON_THE_MODEL:
         raise UserError(
-            f"{folder}: the adapter was initialised by {start}, which changes the weights of the model itself; only "
-            "LoRA on the unchanged model is supported. Convert it with peft (save_pretrained with "
+            f"{folder}: the adapter was initialised by {in_short(start)}, which changes the weights of the model "
+            "itself; only LoRA on the unchanged model is supported. Convert it with peft (save_pretrained with "
             "path_initial_model_for_weight_conversion)."
         )
     known = {*WITHOUT_EFFECT, "init_lora_weights"}
     special = [name for name, value in config.items() if value and name not in known and (name, value) != PLAIN_BIAS]
     if special:
-        raise UserError(f"{folder}: the adapter uses {', '.join(special)}; only plain LoRA of one rank is supported.")
+        used = in_short(", ".join(special))
+        raise UserError(f"{folder}: the adapter uses {used}; only plain LoRA of one rank is supported.")
 
 
 def lora_layers(tensors: Mapping[str, Tensor]) -> list[str]:

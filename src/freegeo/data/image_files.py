@@ -225,23 +225,35 @@ def rgb_pixels(image: PillowImage, path: Path | str, white: float | None = None)
         path: of its file, or its name.
         white: value that becomes 255 in images of more than 8 bits a channel; None: `white_value` of the image.
     """
-    values = deep_values(image, path)
-    if values is not None:
-        return rgb_on_white(scaled(values, white_value(values, path) if white is None else white))
-    _load(image, path)
-    return _turned(rgb_on_white(image), orientation(image, of_file=isinstance(path, Path)))
+    with _in_memory(image, path):
+        values = deep_values(image, path)
+        if values is not None:
+            return rgb_on_white(scaled(values, white_value(values, path) if white is None else white))
+        _load(image, path)
+        return _turned(rgb_on_white(image), orientation(image, of_file=isinstance(path, Path)))
 
 
 def rgba_pixels(image: PillowImage, path: Path) -> np.ndarray:
     """Decode an opened image of 8 bits to upright RGB and opacity (H, W, 4) uint8."""
-    _load(image, path)
-    return _turned(np.asarray(image.convert("RGBA")), orientation(image))
+    with _in_memory(image, path):
+        _load(image, path)
+        return _turned(np.asarray(image.convert("RGBA")), orientation(image))
 
 
 def stored_values(image: PillowImage, path: Path) -> np.ndarray:
     """Decode an opened image to its values as they are stored, (H, W) or (H, W, C), not turned."""
-    _load(image, path)
-    return np.array(image)
+    with _in_memory(image, path):
+        _load(image, path)
+        return np.array(image)
+
+
+@contextmanager
+def _in_memory(image: PillowImage, path: Path | str) -> Generator[None]:
+    """Turn exhausted memory into an `UnreadableImageError`, so that the file is named."""
+    try:
+        yield
+    except MemoryError:
+        raise UnreadableImageError(path, f"{image.width} x {image.height} pixels do not fit into memory") from None
 
 
 def deep_values(image: PillowImage, path: Path | str) -> np.ndarray | None:

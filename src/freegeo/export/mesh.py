@@ -91,10 +91,7 @@ def load_mesh(path: Path) -> Trimesh:
     """Read what `write_mesh` wrote, with its colours; FreeGeoError when the file is damaged."""
     from freegeo.fusion.mesh import load_geometry
 
-    try:
-        found = load_geometry(path, force="mesh")
-    except (ValueError, LookupError, OSError, TypeError) as error:
-        raise FreeGeoError(f"{path}: damaged mesh ({error}). Export it again.") from None
+    found = load_geometry(path, force="mesh")
     if not hasattr(found, "faces"):
         raise FreeGeoError(f"{path}: holds no triangles. Export it again.")
     return found

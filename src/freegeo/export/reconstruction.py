@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from freegeo import files
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import FreeGeoError, UserError, in_short
 from freegeo.export.base import DEFAULT_FORMATS, MAX_TRACKS, DepthSize, Export, Exported, Format
 from freegeo.fusion.settings import MAX_POINTS, FilterSettings
 
@@ -47,8 +47,8 @@ _CAMERAS = ("T_cam_world", "K")
 _VIEWS = (-1, -1, -1)
 _ROTATION_SLACK = 0.01
 """Largest entry of R R^T - 1 in a file; that of float32 rotations is a thousand times smaller."""
-_SMALLEST_FOCAL = 1e-3
-"""In pixels, below which a number in a file is no focal length."""
+_SMALLEST_FOCAL, _LONGEST = 1e-3, 1_000_000
+"""In pixels, below which a number in a file is no focal length, and beyond which none is a side of an image."""
 _KINDS: dict[str, files.Kind] = {
     "depth_z": ("f", _VIEWS), "conf": ("f", _VIEWS), "images": ("u", (-1, -1, -1, 3)), "names": ("U", (-1,)),
     "photo_hw": ("iu", (-1, 2)), "scale_xy": ("f", (-1, 2)), "offset_xy": ("f", (-1, 2)),
@@ -352,24 +352,31 @@ class Reconstruction:
             found = cls(**values, names=tuple(map(str, arrays["names"])), scale=Scale.from_arrays(arrays))
         except (FreeGeoError, ValueError) as error:
             raise FreeGeoError(f"{file}: not a reconstruction ({error}) Name another file.") from None
-        for name, are_cameras in found._camera_checks().items():
-            if not are_cameras.all():
-                view = found.names[int(np.argmin(are_cameras))]
-                raise FreeGeoError(f"{file}: damaged, {name} of {view!r} is not that of a camera. Run again.")
+        with np.errstate(all="ignore"):
+            checks = found._checks()
+        for name, can_be in checks.items():
+            views = can_be.reshape(len(found), -1).all(1)
+            if not views.all():
+                view = in_short(found.names[int(np.argmin(views))])
+                raise FreeGeoError(f"{file}: damaged, {name} of {view} is not that of a photo. Run again.")
         return found
 
-    def _camera_checks(self) -> dict[str, np.ndarray]:
-        """Return by field which views (S,) bool have numbers that a camera can have."""
-        checks = {}
-        with np.errstate(all="ignore"):
-            if self.T_cam_world is not None:
-                R = self.T_cam_world[:, :3, :3].astype(np.float64)
-                square = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
-                checks["T_cam_world"] = np.isfinite(self.T_cam_world).all((1, 2)) & (square < _ROTATION_SLACK)
-            if self.K is not None:
-                focal = np.minimum(self.K[:, 0, 0], self.K[:, 1, 1])
-                below = (self.K[:, 1, 0] == 0) & (self.K[:, 2] == (0, 0, 1)).all(1)
-                checks["K"] = np.isfinite(self.K).all((1, 2)) & (focal > _SMALLEST_FOCAL) & below
+    def _checks(self) -> dict[str, np.ndarray]:
+        """Return by field (S, ...) bool whether a photo and its camera can have such numbers."""
+        seen = self.photo_hw[:, ::-1] * self.scale_xy
+        checks = {
+            "photo_hw": (self.photo_hw >= 1) & (self.photo_hw <= _LONGEST),
+            "scale_xy": (seen > 1 / _LONGEST) & (seen < _LONGEST),
+            "offset_xy": np.abs(self.offset_xy) < _LONGEST,
+        }
+        if self.T_cam_world is not None:
+            R = self.T_cam_world[:, :3, :3].astype(np.float64)
+            turned = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)) < _ROTATION_SLACK
+            checks["T_cam_world"] = np.isfinite(self.T_cam_world) & turned.all((1, 2), keepdims=True)
+        if self.K is not None:
+            focal = np.minimum(self.K[:, 0, 0], self.K[:, 1, 1]) > _SMALLEST_FOCAL
+            below = (self.K[:, 1, 0] == 0) & (self.K[:, 2] == (0, 0, 1)).all(1)
+            checks["K"] = np.isfinite(self.K) & (focal & below)[:, None, None]
         return checks
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import DamagedError, FreeGeoError, UserError
 
 EMPTY_MESH_SEED = 42
 KINDS = ("ply", "obj", "stl", "off")
@@ -101,7 +101,7 @@ def read_points(path: Path) -> np.ndarray:
 def load_geometry(path: Path, **options: Any) -> Any:
     """Read one file with trimesh, by its ending, and none that it names: textures of any kind, other meshes, addresses.
 
-    UserError when there is no such file, or it is of another kind than `KINDS`; damaged ones raise what trimesh raises.
+    UserError when there is no such file, or it is of another kind than `KINDS`; DamagedError when it cannot be read.
     """
     import trimesh
 
@@ -111,5 +111,11 @@ def load_geometry(path: Path, **options: Any) -> Any:
     kind = path.suffix.lower().removeprefix(".")
     if kind not in KINDS:
         raise UserError(f"{path}: a mesh is read from {', '.join(KINDS)}. Convert it.")
-    # Without the file's path trimesh cannot find what the file refers to.
-    return trimesh.load(io.BytesIO(path.read_bytes()), file_type=kind, process=False, skip_materials=True, **options)
+    content = io.BytesIO(path.read_bytes())
+    try:
+        # Without the file's path trimesh cannot find what the file refers to.
+        return trimesh.load(content, file_type=kind, process=False, skip_materials=True, **options)
+    except MemoryError:
+        raise
+    except Exception as error:  # for damaged files trimesh raises all kinds, UnboundLocalError among them
+        raise DamagedError(path, f"{type(error).__name__}: {error}", "Copy or export it again.") from None
