@@ -7,6 +7,8 @@ from torture.fuzz import NAMES, fuzz
 QUICK = (
     "matches.npz", "weights", "weights index", "adapter config", "adapter notes", "adapter state", "photo .jpg",
 )  # fmt: skip
+MADE_AGAIN = {"matches.npz", "bench scores"}
+"""What is computed again where the file is damaged."""
 SHARES = 4
 
 
@@ -19,7 +21,7 @@ def test_damaged_files_are_read_or_refused_in_one_sentence(tmp_path):
     assert faults(outcomes) == []
     assert sum(outcome.cases for outcome in outcomes.values()) == 10 * len(QUICK)
     # Mutations that nothing reads, or that all are refused at the first byte, would test nothing.
-    assert all(outcomes[name].refused for name in QUICK if name != "matches.npz")
+    assert all(outcomes[name].refused for name in QUICK if name not in MADE_AGAIN)
 
 
 @pytest.mark.slow
@@ -27,4 +29,4 @@ def test_damaged_files_are_read_or_refused_in_one_sentence(tmp_path):
 def test_every_kind(tmp_path, share):
     outcomes = fuzz(tmp_path, 10_000 // SHARES, 1, NAMES[share::SHARES])
     assert faults(outcomes) == []
-    assert all(outcome.refused for outcome in outcomes.values())
+    assert all(outcome.refused for name, outcome in outcomes.items() if name not in MADE_AGAIN)
