@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
 
 from data.test_photos import ORIENTATION, STORED, names, quarters, refusal, save
 from freegeo.data.datasets.base import read_gray
@@ -312,6 +313,18 @@ def announced(kind: str, side: int) -> bytes:
         table = content.index(struct.pack("<HHI", 256, 4, 1))
         content[table + 8 : table + 12] = content[table + 20 : table + 24] = struct.pack("<I", side)
     return bytes(content)
+
+
+@pytest.mark.parametrize("door", [lambda path: load_photos([path])[0].read(), read_gray], ids=["photo", "map"])
+def test_an_image_that_does_not_fit_into_memory_is_named(tmp_path, monkeypatch, door):
+    def fail(image):
+        raise MemoryError
+
+    path = tmp_path / "a.png"
+    save(path)
+    monkeypatch.setattr(PngImageFile, "load", fail)
+    with pytest.raises(UnreadableImageError, match=r"a\.png: \d+ x \d+ pixels do not fit into memory"):
+        door(path)
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG", "TIFF", "WEBP"])

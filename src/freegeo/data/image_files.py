@@ -166,11 +166,15 @@ def orientation(image: PillowImage, *, of_file: bool = True) -> int | None:
     """Return the orientation, 1 to 8, that the EXIF data of an image say; None where these are damaged.
 
     Only this field is read of them. Of a PNG all pixels are decoded, since the field may come after them. `of_file`
-    False: the image is a user's, who may have changed the field after opening.
+    False: the image is a user's, who may have changed the field after opening. `UnreadableImageError` when they do not
+    fit into memory.
     """
     found, damaged = [], False
     try:
-        found.append(image.getexif().get(_ORIENTATION_TAG))
+        with _in_memory(image, getattr(image, "filename", None) or "an image in memory"):
+            found.append(image.getexif().get(_ORIENTATION_TAG))
+    except UnreadableImageError:
+        raise
     except _DECODER_ERRORS:
         damaged = True
     # Pillow stops at the first field that is damaged; the orientation may come after it.
