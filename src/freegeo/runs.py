@@ -14,9 +14,8 @@ from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypedDict, get_args
 
-from msgspec import Meta
-
 import numpy as np
+from msgspec import Meta
 
 from freegeo.adaptation.adapt import require_unchanged_images
 from freegeo.adaptation.adapter_files import WEIGHTS, read_peft

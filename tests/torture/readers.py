@@ -153,7 +153,7 @@ def _summary(folder: Path) -> Path:
         },
         "known_cameras": {
             "source": "c", "poses": 2, "intrinsics": 2, "scale": 1.0, "rotation_deg": 1.0, "position": 0.1,
-            "measured": {"points": 3, "factor": 1.0},
+            "measured": {"points": 3, "factor": 1.0}, "given": 2, "odd": ["a"], "chunks": 2, "untied": 1,
         },
         "sequence": {
             "chunks": [{"number": n, "piece": 0, "first": n, "last": n} for n in range(2)], "seams": [seam],

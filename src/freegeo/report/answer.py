@@ -29,6 +29,8 @@ LACKING = {
     "prediction are too far apart to be brought together.",
     "proof": "Take photos between those that there are: more pairs can prove more.",
 }
+TIES = frozenset({"given", "odd", "chunks", "untied"})
+"""What the record of known cameras says beside the rest where `ties` has something to tell."""
 WORSE = 0.01
 """Growth of the share of contradicted pixels that a sentence about refinement mentions."""
 
@@ -74,9 +76,9 @@ def ties(known: Mapping[str, Any]) -> str:
     """Return what the known poses of some photos made of a piece of a sequence, for people."""
     untied = f"{known['untied']} of {known['chunks']} chunks without one"
     said = f"{known['given']} given, {len(known['odd'])} of them not used, {untied}"
-    if known["rotation_deg"] is None:
+    if known.get("rotation_deg") is None:
         return f"{said}; the piece is not in their world"
-    far = "" if known["position"] is None else f" and {100 * known['position']:.2g} % of the longest distance"
+    far = "" if known.get("position") is None else f" and {100 * known['position']:.2g} % of the longest distance"
     angle = f"{known['rotation_deg']:.2g} degrees"
     return f"{said}; placed by them, the model's cameras differ from them by {angle}{far} in the median"
 

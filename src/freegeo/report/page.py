@@ -12,7 +12,7 @@ from freegeo import files
 from freegeo.export.colours import DEPTH_MAP, log_colours, log_range
 from freegeo.export.reconstruction import Reconstruction
 from freegeo.report import figures, sequence
-from freegeo.report.answer import HEADER, NOTE, answer, rescaled, ties
+from freegeo.report.answer import HEADER, NOTE, TIES, answer, rescaled, ties
 from freegeo.report.contents import FILES
 from freegeo.report.pairs import PairPicture, pair_pictures
 from freegeo.report.rendering import duration, fill
@@ -161,7 +161,7 @@ def facts(result: Result) -> list[tuple[str, str]]:
         factor = rescaled(summary)
         more = "" if factor is None else f", positions times {factor:.4g}"
         found.append(("known cameras", f"{known['poses']} poses, {known['intrinsics']} intrinsics{more}"))
-        if "untied" in known:
+        if known.keys() >= TIES:
             found.append(("known poses", ties(known)))
     if summary.get("loss"):
         found.append(("loss", f"{summary['loss']['first']:.4f} → {summary['loss']['last']:.4f}"))
