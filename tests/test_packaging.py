@@ -4,9 +4,12 @@ import email
 import importlib.util
 import re
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
@@ -51,6 +54,29 @@ def test_what_freegeo_asks_for_is_pinned():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     asked = {re.match(r"[\w-]+", line)[0] for line in project["dependencies"]} | packages("dev")
     assert {name.replace("_", "-").lower() for name in asked} <= pins("constraints.txt").keys()
+
+
+def test_what_the_pinned_packages_need_is_pinned_for_each_python():
+    """As `pip check` finds there, of the packages that are installed here; the libraries of torch differ by build."""
+    pins = [Requirement(line) for line in (ROOT / "constraints.txt").read_text("utf-8").splitlines()]
+    names = {canonicalize_name(pin.name) for pin in pins if pin.name != "torch"}
+    needs = {
+        name: [Requirement(need) for need in package.requires or ()]
+        for package in metadata.distributions()
+        if (name := canonicalize_name(package.metadata["Name"])) in names
+    }
+    assert needs
+    for python in ("3.11", "3.12", "3.13", "3.14"):
+        environment = {"python_version": python, "python_full_version": f"{python}.0"}
+        there = {canonicalize_name(pin.name) for pin in pins if applies(pin, environment)}
+        for name, asked in needs.items():
+            missing = {canonicalize_name(need.name) for need in asked if applies(need, environment)} - there
+            assert not missing, (python, name)
+
+
+def applies(requirement: Requirement, environment: dict[str, str]) -> bool:
+    """Whether a package is needed in an environment, without extras."""
+    return requirement.marker is None or requirement.marker.evaluate({**environment, "extra": ""})
 
 
 def test_no_file_names_a_package_index():

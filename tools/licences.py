@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 
+from packaging.requirements import Requirement
+
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "licences.md"
 MARK = "<!-- From here on written by `make licences`. -->\n"
@@ -71,6 +73,8 @@ BUNDLED = {
     "torch": ("gomp",),
 }
 """Packages whose wheels bring copyleft libraries along, which is known and explained on the page."""
+ELSEWHERE = {"audioop-lts": "PSF-2.0"}
+"""Licences of packages that are pinned for other versions of Python than the oldest one."""
 
 
 def licence(package: metadata.PackageMetadata) -> str:
@@ -127,8 +131,13 @@ def tables(licences: dict[str, tuple[str, str]]) -> str:
 def main(arguments: list[str]) -> int:
     """Write or compare the page; return the exit code."""
     licences, wrong = {}, []
-    for pin in (ROOT / "constraints.txt").read_text("utf-8").split():
-        name, _, version = pin.partition("==")
+    for line in (ROOT / "constraints.txt").read_text("utf-8").splitlines():
+        pin = Requirement(line)
+        name, version = pin.name, str(pin.specifier).removeprefix("==")
+        if pin.marker is not None and not pin.marker.evaluate():
+            licences[name] = version, ELSEWHERE.get(name, "unknown")
+            wrong += faults(name, licences[name][1], ())
+            continue
         try:
             package = metadata.distribution(name)
         except metadata.PackageNotFoundError:
