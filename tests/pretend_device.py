@@ -84,6 +84,8 @@ class PretendDevice:
         yield torch.cuda, "set_rng_state", lambda state, device=None: None
         yield torch.cuda, "synchronize", lambda device=None: self.waited("all work")
         yield torch.cuda, "manual_seed_all", lambda seed: None
+        # A build for CUDA would ask the driver, which is not there.
+        yield torch.accelerator, "current_accelerator", lambda check_available=False: None
         yield torch.cuda, "mem_get_info", lambda device=None: (16 << 30, 16 << 30)
         yield torch.cuda, "memory_reserved", lambda device=None: 0
         yield torch.cuda, "memory_allocated", lambda device=None: 0

@@ -34,6 +34,12 @@ POLL_S = 0.1
 """Seconds between two looks at what has ended."""
 REACH_S = 10.0
 """Seconds in which a ray cluster has to answer."""
+LOOK_S = 1.0
+"""Seconds between two looks at whether the ray cluster is there."""
+SILENT_S = 30.0
+"""Seconds without the head of a ray cluster after which it is gone; after 60, ray itself ends the process."""
+RETURN_S = 120.0
+"""Seconds in which a ray cluster that is gone has to be back."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +176,8 @@ class RayPool:
     """Work on the cluster that ray is connected to (`RAY_ADDRESS`), or on the processors of this machine.
 
     All machines must see the folders that the work reads and writes. Used as a context, it stops the work that is left
-    at the end.
+    at the end. When the cluster, or ray on this machine, ends and is back within `RETURN_S` seconds, the pool connects
+    anew and starts what has not ended again, `RETRIES` times.
 
     Args:
         work: a function of a module, or a partial of one; takes an item, and whether its worker died before.
@@ -183,6 +190,8 @@ class RayPool:
 
     def __init__(self, work: Callable[[Any, bool], Any], *, gpu: bool | None, fresh: bool = False):
         self._ray, self._is_own = _connected()
+        self._ends = _Ends(self._ray)
+        self._returns = 0
         if gpu is None:
             gpu = self._ray.cluster_resources().get("GPU", 0) >= 1
         resources = {"num_gpus": 1} if gpu else {"num_cpus": 1}
@@ -206,11 +215,39 @@ class RayPool:
         self._running[self._remote.remote(__version__, self._work, item, again)] = item
 
     def ended(self) -> list[tuple[Any, Any]]:
-        """Wait a moment, and return what has ended; FreeGeoError for an error of the work itself."""
+        """Wait a moment, and return what has ended; FreeGeoError for an error of the work itself, or a lost cluster."""
         # A signal that comes while ray itself waits would end this process with ray's exit code.
         time.sleep(POLL_S)
+        if self._ends.are_gone():
+            self._return()
         done, _ = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=0)
         return [(self._running.pop(reference), self._outcome(reference)) for reference in done]
+
+    def _return(self) -> None:
+        """Connect anew, and start what was running again."""
+        self._returns += 1
+        if self._returns > RETRIES or not self._is_own:
+            raise FreeGeoError("the ray cluster is gone. The same command continues when it is there again.")
+        logger.warning(
+            "the ray cluster is gone, or ray on this machine. What was running is started again and continues where it "
+            "was, if the cluster is back within %.0f s (%d of %d times).",
+            RETURN_S, self._returns, RETRIES,
+        )  # fmt: skip
+        items = list(self._running.values())
+        self._running.clear()
+        self._ray.shutdown()
+        deadline = time.monotonic() + RETURN_S
+        while True:
+            try:
+                self._ray, self._is_own = _connected()
+                break
+            except UserError as error:
+                if time.monotonic() > deadline:
+                    raise FreeGeoError(f"{error} Start the cluster; then the same command continues.") from None
+            time.sleep(LOOK_S)
+        self._ends = _Ends(self._ray)
+        for item in items:
+            self.start(item, again=True)
 
     def _outcome(self, reference: Any) -> Any:
         errors = self._ray.exceptions
@@ -228,6 +265,41 @@ class RayPool:
         for warning in warnings:
             logger.warning("%s", warning)
         return outcome
+
+
+class _Ends:
+    """What a connection to a ray cluster rests on: ray on this machine, and the head of the cluster.
+
+    ray tells of neither: without the first it waits for ever, without the second it ends this process after a minute.
+    A client (`ray://`) sees neither, so that they are not watched.
+    """
+
+    def __init__(self, ray: Any):
+        self._here = self._head = None
+        self._looked = self._answered = time.monotonic()
+        if os.environ.get("RAY_ADDRESS", "").startswith("ray://"):
+            return
+        about = ray.get_runtime_context()
+        node = next(node for node in ray.nodes() if node["NodeID"] == about.get_node_id())
+        self._here, self._head = f"{node['NodeManagerAddress']}:{node['NodeManagerPort']}", about.gcs_address
+
+    def are_gone(self) -> bool:
+        """Look once in `LOOK_S` seconds whether one of the ends is gone."""
+        now = time.monotonic()
+        if self._here is None or self._head is None or now - self._looked < LOOK_S:
+            return False
+        self._looked = now
+        try:
+            _require_reachable(self._here)
+        except ConnectionRefusedError:
+            return True
+        except OSError:
+            # A busy machine may be late.
+            return False
+        with contextlib.suppress(OSError):
+            _require_reachable(self._head)
+            self._answered = now
+        return now - self._answered > SILENT_S
 
 
 def _carry_out(version: str, work: Callable[[Any, bool], Any], item: Any, again: bool) -> tuple[Any, list[str]]:
@@ -268,7 +340,8 @@ def _connected() -> tuple[Any, bool]:
         ray.init(log_to_driver=False, logging_level=logging.WARNING)
     except (OSError, RuntimeError, ValueError) as error:
         where = f" with RAY_ADDRESS={address}" if address else ""
-        raise UserError(f"ray cannot be used{where}: {' '.join(str(error).split())}.") from None
+        token = " Set RAY_AUTH_MODE=token where the cluster asks for a token." if address else ""
+        raise UserError(f"ray cannot be used{where}: {' '.join(str(error).split())}.{token}") from None
     if threading.current_thread() is threading.main_thread():
         # It puts a handler of its own there, after which SIGTERM would not end this process as it should.
         signal.signal(signal.SIGTERM, before)

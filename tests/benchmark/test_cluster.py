@@ -1,5 +1,6 @@
 import logging
 import os
+import socket
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -32,30 +33,55 @@ class RayTaskError(RayError):
 
 
 class InlineRay:
-    """What is used of ray, carried out in this process; the first `deaths` workers die."""
+    """What is used of ray, carried out in this process; the first `deaths` workers die.
+
+    It listens at a port, as ray on this machine and the head of a cluster do. It ends `ends` times, each time when a
+    result is asked for, and is back after `misses` vain connections.
+    """
 
     exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
 
-    def __init__(self, deaths=0):
+    def __init__(self, deaths=0, ends=0, misses=0):
         self.options, self.deaths, self.shut = [], deaths, False
+        self.ends, self.misses, self.started = ends, misses, 0
 
     def is_initialized(self):
         return False
 
     def init(self, **options):
-        pass
+        if self.started:
+            self.misses -= 1
+            if self.misses >= 0:
+                raise ConnectionError("nobody is there")
+        self.port = socket.create_server(("127.0.0.1", 0))
 
     def shutdown(self):
         self.shut = True
+        self.port.close()
+
+    def nodes(self):
+        host, port = self.port.getsockname()
+        return [{"NodeID": "this", "NodeManagerAddress": host, "NodeManagerPort": port}]
+
+    def get_runtime_context(self):
+        return SimpleNamespace(get_node_id=lambda: "this", gcs_address="{}:{}".format(*self.port.getsockname()))
 
     def cancel(self, reference, force):
         pass
 
     def remote(self, **options):
         self.options.append(options)
-        return lambda work: SimpleNamespace(remote=lambda *arguments: _Reference(work, arguments))
+        return lambda work: SimpleNamespace(remote=lambda *arguments: self._started(work, arguments))
+
+    def _started(self, work, arguments):
+        self.started += 1
+        return _Reference(work, arguments)
 
     def wait(self, references, num_returns, timeout):
+        if self.ends:
+            self.ends -= 1
+            self.port.close()
+            return [], references
         return references[:1], references[1:]
 
     def get(self, reference):
@@ -110,6 +136,34 @@ def test_work_whose_worker_dies_every_time_is_a_problem(predictor, use_ray):
     (problem,) = predict_on_cluster(predictor, [task(), task(scene=ROOMS[1])])
     assert "its worker died 3 times, the last time of RayError" in str(problem)
     assert len(stored_tasks(predictor.setup.out)) == 1
+
+
+def test_a_cluster_that_comes_back_is_given_what_has_not_ended(predictor, use_ray, monkeypatch, caplog):
+    monkeypatch.setattr(pools, "LOOK_S", 0.0)
+    ray = use_ray(ends=1, misses=2)
+    tasks = [task(), task(scene=ROOMS[1])]
+    assert predict_on_cluster(predictor, tasks) == []
+    assert ray.started == 4
+    assert {one for one, _ in stored_tasks(predictor.setup.out)} == set(tasks)
+    assert len([message for message in caplog.messages if "the ray cluster is gone" in message]) == 1
+
+
+@pytest.mark.parametrize(
+    ("faults", "words"), [({"ends": 1, "misses": 99}, "nobody is there"), ({"ends": 9}, "is gone")]
+)
+def test_a_cluster_that_stays_away_is_named(predictor, use_ray, monkeypatch, faults, words):
+    monkeypatch.setattr(pools, "LOOK_S", 0.0)
+    monkeypatch.setattr(pools, "RETURN_S", 0.1)
+    use_ray(**faults)
+    with pytest.raises(FreeGeoError, match=rf"{words}.*[Tt]he same command continues"):
+        predict_on_cluster(predictor, [task()])
+
+
+def test_a_machine_that_does_not_see_the_data_is_named(predictor, use_ray, monkeypatch):
+    use_ray()
+    monkeypatch.setattr(cluster, "gethostname", lambda: "node-7")
+    (problem,) = predict_on_cluster(predictor, [task(scene="7")])
+    assert str(problem).endswith("(on node-7)")
 
 
 def test_what_the_work_warns_of_and_fails_with_is_told_here(predictor, use_ray, monkeypatch, caplog):

@@ -25,7 +25,7 @@ from freegeo.cli.files import FileOptions, FilterOptions
 from freegeo.cli.options import ModelOptions, PhotoOptions, PlacingOptions, RecipeOptions
 from freegeo.cli.scenes import named_scenes
 from freegeo.errors import UserError
-from freegeo.files import read_json
+from freegeo.files import read_json, write_json
 from freegeo.report.overview import SceneRow
 from freegeo.run_folder import run_folder
 from processes import kill_one, needs_proc
@@ -234,7 +234,12 @@ def test_places_that_are_taken_are_refused(freegeo, photo_folder, tiny, tmp_path
 
 
 class HerePool:
-    """Works in this process, as a worker of ray does; the first start of a scene in `dies` is its worker's death."""
+    """Works in this process, as a worker of ray does; the first start of a scene in `dies` is its worker's death.
+
+    It dies before it has looked at the folder of the scene, or, with `dies_late`, when it has begun to replace it.
+    """
+
+    dies_late = False
 
     def __init__(self, out, dies=()):
         self.work, self.dies, self.running, self.commands = partial(_in_worker, out), set(dies), [], []
@@ -254,6 +259,8 @@ class HerePool:
             return []
         item, again = self.running.pop(0)
         if str(item) in self.dies and not again:
+            if self.dies_late and item.state.is_file():
+                write_json(item.state, {**read_json(item.state), "finished": None})
             return [(item, pools.Died("SIGKILL"))]
         code = self.work(item, again)
         # Messages went to the log, which is closed; another process would have handlers of its own.
@@ -322,11 +329,22 @@ def test_scenes_fail_on_their_own_and_the_same_command_continues(freegeo, here, 
     assert "photos with other contents" in read_json(out / "batch.json")["scenes"][-1]["error"]
 
 
-def test_a_retry_does_not_overwrite_what_it_continues(freegeo, here, rooms, tiny, tmp_path):
+def test_a_retry_overwrites_what_is_old_and_not_what_it_continues(freegeo, here, rooms, tiny, tmp_path, monkeypatch):
     command = ["batch", rooms / "room-0", "-o", tmp_path / "out", *tiny, *FROZEN, "--overwrite"]
-    for _ in range(2):
+    for late, overwrites in ((False, True), (True, False)):
+        monkeypatch.setattr(HerePool, "dies_late", late)
         assert freegeo(*command).code == 0
-        assert ["--overwrite" in arguments for arguments in here[-1].commands] == [True, False]
+        assert ["--overwrite" in arguments for arguments in here[-1].commands] == [True, overwrites]
+
+
+def test_a_machine_that_does_not_see_the_photos_is_named(freegeo, here, rooms, tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr("freegeo.cli.batch.gethostname", lambda: "node-7")
+    photos, start = rooms / "room-1", HerePool.start
+    monkeypatch.setattr(HerePool, "start", lambda *given, again: (shutil.rmtree(photos), start(*given, again=again)))
+    assert freegeo("batch", photos, "-o", tmp_path / "out", *tiny, *FROZEN).code == 1
+    (row,) = read_json(tmp_path / "out" / "batch.json")["scenes"]
+    assert "room-1" in row["error"]
+    assert row["error"].endswith("(on node-7, a machine of the ray cluster)")
 
 
 @pytest.mark.slow
@@ -395,19 +413,31 @@ def require_equal(folder: Path, other: Path) -> None:
                 assert all(np.array_equal(arrays[key], others[key]) for key in arrays.files)
 
 
+needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra cluster")
+
+
 @pytest.mark.slow
 @needs_proc
 @pytest.mark.parametrize(
     ("how", "worker"),
     [
         (["--jobs", "2"], "freegeo.cli.app run"),
-        pytest.param(
-            ["--cluster"], "ray::_carry_out",
-            marks=pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra cluster"),
-        ),
+        pytest.param(["--cluster"], "ray::_carry_out", marks=needs_ray),
     ],
-)  # fmt: skip
+)
 def test_a_killed_worker_is_replaced_and_results_are_those_of_plain_runs(freegeo, rooms, tiny, tmp_path, how, worker):
+    require_recovery(freegeo, rooms, tiny, tmp_path, how, worker, "its worker died")
+
+
+@pytest.mark.slow
+@needs_proc
+@needs_ray
+def test_a_killed_ray_is_started_again_and_results_are_those_of_plain_runs(freegeo, rooms, tiny, tmp_path):
+    require_recovery(freegeo, rooms, tiny, tmp_path, ["--cluster"], "raylet/raylet", "the ray cluster is gone")
+
+
+def require_recovery(freegeo, rooms, tiny, tmp_path, how, killed, words):
+    """Require the results of plain runs of a batch of which a process is killed, which it says in these words once."""
     options = [*tiny, *QUICK, "--refine", "off"]
     out = tmp_path / "out"
     program = [sys.executable, "-P", "-m", "freegeo.cli.app"]
@@ -417,10 +447,10 @@ def test_a_killed_worker_is_replaced_and_results_are_those_of_plain_runs(freegeo
     environment = {**os.environ, "PYTHONPATH": path}
     log = out / "room-0.log"
     with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
-        kill_one(process.pid, worker, lambda: log.is_file() and "adaptation" in log.read_text())
+        kill_one(process.pid, killed, lambda: log.is_file() and "adaptation" in log.read_text())
         _, messages = process.communicate(timeout=600)
     assert process.returncode == 0, messages
-    assert messages.count("its worker died") == 1
+    assert messages.count(words) == 1
     for name in ("room-0", "room-1"):
         assert freegeo("run", rooms / name, "-o", tmp_path / name, *options).code == 0
         require_equal(out / name, tmp_path / name)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
+from socket import gethostname
 from typing import Any
 
 from freegeo.benchmark.adapters import AdapterJob
@@ -54,8 +55,11 @@ def _carry_out(setup: Setup, item: AdapterJob | Task, again: bool) -> list[Probl
     """Train an adapter or make a prediction, in a worker; what a dead worker left is continued or made anew."""
     predictor = _worker(_Key(setup))
     if isinstance(item, AdapterJob):
-        return run_each([item], predictor.adapt, adaptation_problem)
-    return run_each([item], predictor.predict, problem_of("predict"))
+        problems = run_each([item], predictor.adapt, adaptation_problem)
+    else:
+        problems = run_each([item], predictor.predict, problem_of("predict"))
+    # Another machine may see what this one does not.
+    return [replace(problem, reason=f"{problem.reason} (on {gethostname()})") for problem in problems]
 
 
 def _local(setup: Setup) -> Setup:

@@ -13,6 +13,7 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
+from socket import gethostname
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
@@ -61,13 +62,18 @@ class _Work:
     log: Path
     asked: str
     """Fingerprint of the command, of the files that it reads and of the weights."""
+    state: Path
+    """File with the state of its folder."""
+    before: int | None
+    """Time of that file before the batch; None: there was none."""
 
     def command(self, *, again: bool) -> list[str]:
         """Return the arguments of `freegeo`.
 
-        After a death --overwrite is left out, so that what the dead process has done by then is continued.
+        After a death --overwrite is left out where the dead process had begun to overwrite, so that it is continued.
         """
-        return [*self.arguments, *(["--overwrite"] if self.overwrite and not again else [])]
+        begun = again and _written(self.state) != self.before
+        return [*self.arguments, *(["--overwrite"] if self.overwrite and not begun else [])]
 
     def __str__(self) -> str:
         return self.scene.name
@@ -228,8 +234,14 @@ def _work(
     text = json.dumps([__version__, arguments, common, seen])
     return _Work(
         scene=scene, arguments=arguments, overwrite=output.overwrite, log=place.with_name(f"{scene.name}{LOG}"),
-        asked=hashlib.sha256(text.encode()).hexdigest()[:16],
+        asked=hashlib.sha256(text.encode()).hexdigest()[:16], state=place / RUN_FILE,
+        before=_written(place / RUN_FILE),
     )  # fmt: skip
+
+
+def _written(path: Path) -> int | None:
+    """Return when a file was last written, in ns; None when it is not there."""
+    return path.stat().st_mtime_ns if path.is_file() else None
 
 
 class _Table:
@@ -386,13 +398,18 @@ def _in_worker(out: Path, work: _Work, again: bool) -> int:
     from freegeo.cli.app import FAILURE, main
 
     if not (out / RUN_FILE).is_file():
-        raise UserError(f"a machine of the ray cluster does not see {out}; all machines must see the folders.")
+        raise UserError(f"{gethostname()}, a machine of the ray cluster, does not see {out}; all of them must see it.")
     with work.log.open("a", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
         try:
-            return main(work.command(again=again))
+            code = main(work.command(again=again))
         except Exception:
             traceback.print_exc()
-            return FAILURE
+            code = FAILURE
+        if code not in (DONE, PARTIAL):
+            # Another machine may see what this one does not.
+            log.flush()
+            print(f"freegeo: {_reason(work.log)} (on {gethostname()}, a machine of the ray cluster)")
+        return code
 
 
 def environments(jobs: int | None, device: str | None) -> list[dict[str, str]]:
