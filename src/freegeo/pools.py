@@ -334,13 +334,14 @@ def _connected() -> tuple[Any, bool]:
         raise UserError("--cluster needs ray: pip install 'freegeo[cluster]'.") from None
     if ray.is_initialized():
         return ray, False
-    before, address = signal.getsignal(signal.SIGTERM), os.environ.get("RAY_ADDRESS", "")
+    before, address, token = signal.getsignal(signal.SIGTERM), os.environ.get("RAY_ADDRESS", ""), ""
     try:
         _require_reachable(address)
+        if address:
+            token = " Set RAY_AUTH_MODE=token if the cluster asks for a token."
         ray.init(log_to_driver=False, logging_level=logging.WARNING)
     except (OSError, RuntimeError, ValueError) as error:
         where = f" with RAY_ADDRESS={address}" if address else ""
-        token = " Set RAY_AUTH_MODE=token where the cluster asks for a token." if address else ""
         raise UserError(f"ray cannot be used{where}: {' '.join(str(error).split())}.{token}") from None
     if threading.current_thread() is threading.main_thread():
         # It puts a handler of its own there, after which SIGTERM would not end this process as it should.

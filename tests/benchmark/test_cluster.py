@@ -197,6 +197,17 @@ def test_machines_with_another_version_are_refused(predictor, use_ray, monkeypat
         predict_on_cluster(predictor, [task()])
 
 
+def test_a_cluster_that_refuses_a_connection_may_ask_for_a_token(predictor, monkeypatch):
+    def refuse(**options):
+        raise ConnectionError("Failed to connect")
+
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(is_initialized=lambda: False, init=refuse))
+    with socket.create_server(("127.0.0.1", 0)) as there:
+        monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:{}".format(there.getsockname()[1]))
+        with pytest.raises(UserError, match="RAY_AUTH_MODE=token"):
+            predict_on_cluster(predictor, [task()])
+
+
 def test_without_ray_the_extra_is_named(predictor, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match="cluster"):
