@@ -1,4 +1,5 @@
 import logging
+import math
 import os
 import socket
 import subprocess
@@ -148,13 +149,11 @@ def test_a_cluster_that_comes_back_is_given_what_has_not_ended(predictor, use_ra
     assert len([message for message in caplog.messages if "the ray cluster is gone" in message]) == 1
 
 
-@pytest.mark.parametrize(
-    ("faults", "words"), [({"ends": 1, "misses": 99}, "nobody is there"), ({"ends": 9}, "is gone")]
-)
-def test_a_cluster_that_stays_away_is_named(predictor, use_ray, monkeypatch, faults, words):
+@pytest.mark.parametrize(("ends", "misses", "words"), [(1, math.inf, "nobody is there"), (9, 0, "is gone")])
+def test_a_cluster_that_stays_away_is_named(predictor, use_ray, monkeypatch, ends, misses, words):
     monkeypatch.setattr(pools, "LOOK_S", 0.0)
     monkeypatch.setattr(pools, "RETURN_S", 0.1)
-    use_ray(**faults)
+    use_ray(ends=ends, misses=misses)
     with pytest.raises(FreeGeoError, match=rf"{words}.*[Tt]he same command continues"):
         predict_on_cluster(predictor, [task()])
 
@@ -203,7 +202,7 @@ def test_a_cluster_that_refuses_a_connection_may_ask_for_a_token(predictor, monk
 
     monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(is_initialized=lambda: False, init=refuse))
     with socket.create_server(("127.0.0.1", 0)) as there:
-        monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:{}".format(there.getsockname()[1]))
+        monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{there.getsockname()[1]}")
         with pytest.raises(UserError, match="RAY_AUTH_MODE=token"):
             predict_on_cluster(predictor, [task()])
 
