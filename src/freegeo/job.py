@@ -433,8 +433,9 @@ class Job:
         """Refine a prediction, unless that is done, and write what comes of it where it is accepted."""
         path, before = self.folder.path, self.folder / UNREFINED_FOLDER
         noted = self._noted("refinement")
-        # The folder of a chunk may have been removed, and made again but for its refinement.
-        if "accepted" not in noted or (noted["accepted"] and not (path / TRACKS_NAME).is_file()):
+        # The folder of a chunk may have been removed and made again, but for this; others may need its matches.
+        there = path / (TRACKS_NAME if noted.get("accepted") else MATCHES_NAME)
+        if "accepted" not in noted or not there.is_file():
             assert self.photos is not None
             with self._timed("refinement", REFINEMENT):
                 found = refine_by_photos(

@@ -570,6 +570,7 @@ class SequenceJob(Job):
                     "reason": self.failed.get(
                         number, None if number in piece_of else _SPARE if number in self.spare else _NOT_NEEDED
                     ),
+                    "spare": number in self.spare,
                     "refined": refined.get(f"{CHUNKS_FOLDER}/{_chunk_name(number)}", {}).get("accepted"),
                 }
                 for number, chunk in enumerate(chunks)
@@ -607,8 +608,9 @@ class SequenceJob(Job):
         if missing:
             self._warn(f"{missing} of {len(self.batch)} photos are in no chunk that could be predicted.")
         summary: dict[str, Any] = {}
-        for number, (members, frames) in reversed(list(enumerate(pieces))):
-            summary = self._write_piece(number, members, frames, told, adaptation)
+        made = [self._made(number, *piece, told) for number, piece in enumerate(pieces)]
+        for number, (_, frames) in reversed(list(enumerate(pieces))):
+            summary = self._write_piece(number, frames, *made[number], told, adaptation)
         self.after(self)
         self.folder.finish()
         return summary
@@ -635,18 +637,27 @@ class SequenceJob(Job):
         first, last = part["first"], part["last"]
         return f"frames {first} to {last} ({self.photos[first].name} to {self.photos[last].name})"
 
-    def _write_piece(
-        self, number: int, members: Sequence[Member], frames: Sequence[int], told: dict[str, Any],
-        adaptation: Adaptation,
-    ) -> dict[str, Any]:  # fmt: skip
+    def _made(
+        self, number: int, members: Sequence[Member], frames: Sequence[int], told: dict[str, Any]
+    ) -> tuple[Reconstruction, dict[str, Any]]:
+        """Write the prediction of a piece, and note in `told` what became of it; returns it, and facts about it."""
         assert self.photos is not None
         folder, photos = self.folder.path / _piece_folder(number), [self.photos[i] for i in frames]
-        label = "" if number == 0 else f"piece {number + 1}: "
+        label = _piece_label(number)
         self.hooks.stage(f"{label}joining {len(members)} chunks")
         result, about = self._joined(folder, members, frames, photos, label, is_tied=number == self.world)
         told["pieces"][number]["together"] = about.pop("together")
         if not (told["pieces"][number]["together"] or {}).get("accepted"):
             self._doubt_seams(number, told)
+        return result, about
+
+    def _write_piece(
+        self, number: int, frames: Sequence[int], result: Reconstruction, about: dict[str, Any], told: dict[str, Any],
+        adaptation: Adaptation,
+    ) -> dict[str, Any]:  # fmt: skip
+        assert self.photos is not None
+        folder, photos = self.folder.path / _piece_folder(number), [self.photos[i] for i in frames]
+        label = _piece_label(number)
         if result.has_cameras:
             doubt_focal_length(result, photos)
         with self._timed(f"{label}{FILES_STAGE}", FILTERS):
@@ -872,6 +883,10 @@ def _together(found: Refinement) -> dict[str, Any]:
         "pairs": 0 if found.pairs is None else len(found.pairs),
         **{name: None if values is None else float(np.median(values)) for name, values in errors.items()},
     }  # fmt: skip
+
+
+def _piece_label(number: int) -> str:
+    return "" if number == 0 else f"piece {number + 1}: "
 
 
 def _common_scale(members: Sequence[Member]) -> Scale | None:

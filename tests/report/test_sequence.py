@@ -86,10 +86,11 @@ def test_a_missing_chunk_and_a_bridge_are_told(tmp_path):
 def test_a_chunk_whose_frames_surer_ones_have_is_no_problem(tmp_path):
     found = load_result(write_sequence(tmp_path, frames=FRAMES)[0])
     record = found.summary["sequence"]
-    record["chunks"][2] |= {"piece": None, "reason": "no matches prove its cameras."}
+    record["chunks"][2] |= {"piece": None, "spare": True, "reason": "no matches prove its cameras."}
+    record["chunks"][4] |= {"piece": None, "reason": "its prediction has no finite numbers."}
     record["pieces"][0]["together"] = {"accepted": True}
     told = sequence.told(found)
-    assert told.problems == []
+    assert [problem.split(" (")[0] for problem in told.problems] == ["Chunk 4"]
     assert "1 chunk left out: surer ones have these frames." in told.sentences
     assert "All photos refined together, from where the seams put them." in told.sentences
 

@@ -56,6 +56,7 @@ def test_exact_chunks_give_the_whole_and_every_frame_once(whole, size, overlap):
     np.testing.assert_allclose(np.concatenate(list(joined.blocks("depth_z"))), whole.depth_z, rtol=1e-5)
     np.testing.assert_allclose(joined.T_cam_world, T, atol=1e-5)
     np.testing.assert_allclose(joined.K, K, rtol=1e-6)
+    np.testing.assert_array_equal(joined.K[:, 2], np.broadcast_to((0, 0, 1), (FRAMES, 3)))
     np.testing.assert_array_equal(np.concatenate(list(joined.blocks("images"))), whole.images)
     assert len(joined.T_cam_world) == FRAMES
 

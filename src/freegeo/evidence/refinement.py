@@ -55,6 +55,8 @@ DEPTH_SPREAD = 0.25
 """Largest disagreement between refined points and predicted depth, see `Solution.depth_spread`."""
 FEWEST_DEPTHS = 5
 """A view with fewer tracks has no depth factor of its own."""
+MOST_TURNS = 40_000
+"""Pairs of views by which mirror images are told; of more, a seeded choice."""
 FEWEST_AFFINE = 20
 """A view with fewer tracks has no affine correction of its own."""
 
@@ -368,7 +370,10 @@ def _after(
 def _mirrored(before: Tensor, after: Tensor, refined: np.ndarray) -> bool:
     """Whether the relative rotations of the refined views turn the other way, taken together."""
     views = np.flatnonzero(refined)
-    first, second = views[np.stack(np.triu_indices(len(views), 1))]
+    if len(views) ** 2 < MOST_TURNS:
+        first, second = views[np.stack(np.triu_indices(len(views), 1))]
+    else:
+        first, second = views[np.random.default_rng(0).integers(len(views), size=(2, MOST_TURNS))]
     turns = []
     for T in (before, after):
         R = relative(T[first], T[second])[:, :3, :3]

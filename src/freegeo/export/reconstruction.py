@@ -47,6 +47,8 @@ _CAMERAS = ("T_cam_world", "K")
 _VIEWS = (-1, -1, -1)
 _ROTATION_SLACK = 0.01
 """Largest entry of R R^T - 1 in a file; that of float32 rotations is a thousand times smaller."""
+_K_SLACK = 1e-6
+"""Of the entries of K that are 0 or 1: means of several cameras have them but for rounding."""
 _SMALLEST_FOCAL, _LONGEST = 1e-3, 1_000_000
 """In pixels, below which a number in a file is no focal length, and beyond which none is a side of an image."""
 _KINDS: dict[str, files.Kind] = {
@@ -374,8 +376,9 @@ class Reconstruction:
             turned = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)) < _ROTATION_SLACK
             checks["T_cam_world"] = np.isfinite(self.T_cam_world) & turned.all((1, 2), keepdims=True)
         if self.K is not None:
-            focal = np.minimum(self.K[:, 0, 0], self.K[:, 1, 1]) > _SMALLEST_FOCAL
-            below = (self.K[:, 1, 0] == 0) & (self.K[:, 2] == (0, 0, 1)).all(1)
+            # Some models fit the focal length to their points, and of poor ones it may come out below 0.
+            focal = np.abs(self.K[:, (0, 1), (0, 1)]).min(1) > _SMALLEST_FOCAL
+            below = np.abs(self.K[:, (1, 2, 2, 2), (0, 0, 1, 2)] - (0, 0, 0, 1)).max(1) < _K_SLACK
             checks["K"] = np.isfinite(self.K) & (focal & below)[:, None, None]
         return checks
 

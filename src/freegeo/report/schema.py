@@ -108,6 +108,8 @@ class ChunkRecord(TypedDict, total=False):
     piece: Required[int | None]
     first: Required[int]
     last: Required[int]
+    spare: bool
+    """Whether surer chunks have its frames."""
     refined: bool | None
     reason: str | None
     """Why it has no result."""

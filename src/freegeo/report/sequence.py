@@ -181,9 +181,9 @@ def _sentences(sequence: Mapping[str, Any]) -> list[str]:
             if any(together)
             else "No piece refined as a whole."
         )
-    spare = [chunk["number"] for chunk in chunks if chunk["piece"] is None and _is_spare(chunk, sequence)]
+    spare = sum(bool(chunk.get("spare")) for chunk in chunks)
     if spare:
-        found.append(f"{_count(len(spare), 'chunk')} left out: surer ones have these frames.")
+        found.append(f"{_count(spare, 'chunk')} left out: surer ones have these frames.")
     found.append(_seam_sentence(sequence))
     used = sum(bool(loop["used"]) for loop in loops)
     refused = sum(seam["kind"] == "loop" and not seam["used"] for seam in seams)
@@ -217,7 +217,7 @@ def _problems(sequence: Mapping[str, Any]) -> list[str]:
     found = [
         f"Chunk {chunk['number']} ({frames_of[chunk['number']]}) is missing{_because(chunk.get('reason'))}"
         for chunk in sequence["chunks"]
-        if chunk["piece"] is None and not _is_spare(chunk, sequence)
+        if chunk["piece"] is None and not chunk.get("spare")
     ]
     seam_of = {(seam["first"], seam["second"]): seam for seam in sequence["seams"]}
     neighbours = pairwise(chunk["number"] for chunk in sequence["chunks"])
@@ -229,13 +229,6 @@ def _problems(sequence: Mapping[str, Any]) -> list[str]:
     if len(found) > MOST_NAMED:
         found[MOST_NAMED:] = [f"So it is at {len(found) - MOST_NAMED} more places; see the seams below."]
     return found
-
-
-def _is_spare(chunk: Mapping[str, Any], sequence: Mapping[str, Any]) -> bool:
-    """Whether the result has the frames of a chunk that has no part in it."""
-    ranges = (run for piece in sequence["pieces"] for run in piece["ranges"])
-    shown = {frame for first, last in ranges for frame in range(first, last + 1)}
-    return shown.issuperset(range(chunk["first"], chunk["last"] + 1))
 
 
 def _because(reason: str | None) -> str:

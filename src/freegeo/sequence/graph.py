@@ -30,7 +30,7 @@ _MOST_STEPS = 30
 _MEDIANS = 2.0
 """Differences of known poses that halve their weight, in medians of all, where that is more than `KERNEL`."""
 _ROUNDS, _SETTLED = 5, 0.9
-_MOST_PAIRS = 300
+_MOST_PAIRS, _MOST_JUDGES = 300, 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,20 +242,24 @@ def _fit_sights(placed: Sequence[Sim3], sights: Sequence[Sight]) -> Sim3 | None:
         [sim3.apply_to_cameras(one.predicted[None])[0] for sim3, one in zip(seen, sights, strict=True)]
     )
     known = torch.stack([one.known for one in sights])
-    pairs = np.array(list(combinations(range(len(sights)), 2)))
-    if len(pairs) > _MOST_PAIRS:
-        pairs = np.random.default_rng(0).permutation(pairs)[:_MOST_PAIRS]
-    apart = torch.cdist(camera_centres(known), camera_centres(known))
+    rng, judges = np.random.default_rng(0), list(sights)
+    if len(sights) <= _MOST_JUDGES:
+        pairs = rng.permutation(np.array(list(combinations(range(len(sights)), 2))))[:_MOST_PAIRS]
+    else:
+        pairs = rng.integers(len(sights), size=(_MOST_PAIRS, 2))
+        judges = [sights[k] for k in rng.choice(len(sights), _MOST_JUDGES, replace=False)]
+    centres = camera_centres(known)
+    longest = float(torch.linalg.vector_norm(centres - centres.mean(0), dim=-1).max())
     best, least = None, math.inf
     for pair in pairs:
-        if float(apart[tuple(pair)]) <= SHORT_PAIR * float(apart.max()):
+        if float(torch.linalg.vector_norm(centres[pair[0]] - centres[pair[1]])) <= SHORT_PAIR * longest:
             continue
         try:
             fit = fit_cameras(predicted[pair], known[pair])
         except DegenerateAlignmentError:
             continue
         moved = [fit.sim3 @ sim3 for sim3 in placed]
-        ties = [one.edge(moved[one.chunk - 1].s, KERNEL) for one in sights]
+        ties = [one.edge(moved[one.chunk - 1].s, KERNEL) for one in judges]
         median = float(np.median(_Graph.of(ties).lengths([Sim3.identity(), *moved])))
         if median < least:
             best, least = fit.sim3, median

@@ -95,7 +95,9 @@ class Joined:
             K_all.append(
                 (share[:, None, None] * torch.stack([found[number][1][row] for number, row, _ in parts])).sum(0)
             )
-        return torch.stack(T_all).numpy(), torch.stack(K_all).numpy()
+        K = torch.stack(K_all)
+        K[:, 2] = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)  # Shares may sum to 1 but for rounding.
+        return torch.stack(T_all).numpy(), K.numpy()
 
     def _depth(self, frame: int) -> np.ndarray:
         """Depth (H, W): the mean of what chunks say where they agree, else that of the chunk with more weight."""
