@@ -23,12 +23,12 @@ def in_own_process(code: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["adapt", "batch"])
-def test_a_killed_command_ends_as_if_never_stopped(tmp_path, command):
+@pytest.mark.parametrize(("command", "every"), [("adapt", 4), ("batch", 8)])
+def test_a_killed_command_ends_as_if_never_stopped(tmp_path, command, every):
     code = f"""
 from pathlib import Path
 from torture.crash import crash
-o = crash(Path({str(tmp_path)!r}), {command!r}, count=5, every=8, completions=1)
+o = crash(Path({str(tmp_path)!r}), {command!r}, count=5, every={every}, completions=1)
 print(o.faults, o.points >= 2, o.kills >= 5, o.completions >= 1)
 """
     assert in_own_process(code).splitlines()[-1] == "[] True True True"
