@@ -385,6 +385,7 @@ def test_teacher_and_student_are_told_the_same(photos):
     assert adapt(model, [scene], quick(model, views=4, steps=1), seed=1).trouble is None
 
 
+@pytest.mark.slow
 def test_an_adapter_trained_with_cameras_is_another_one_and_says_so(photos, tmp_path):
     options = {"steps": 2, "sets": 2, "guard": "off", "trust_cameras": True}
     results = []
@@ -396,6 +397,7 @@ def test_an_adapter_trained_with_cameras_is_another_one_and_says_so(photos, tmp_
     assert not same(tensors(results[0]), tensors(results[1])) and not same(tensors(results[1]), tensors(results[2]))
 
 
+@pytest.mark.slow
 def test_an_adapter_trained_with_cameras_and_used_without_is_doubted(photos, tmp_path, caplog):
     options = {"cameras": known_for(photos), "trust_cameras": True}
     made = freegeo.adapt(tiny_da3(), photos, steps=2, sets=2, guard="off", **options)

@@ -145,6 +145,7 @@ def test_one_chunk_is_the_same_as_none_to_the_bit(freegeo, walk, tiny, tmp_path)
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "none" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_stopped_run_continues_at_the_first_chunk_that_is_not_finished(freegeo, walk, tiny, tmp_path, oracle):
     def stop(number: int, result: Reconstruction) -> Reconstruction:
         if number == 2:
@@ -400,6 +401,7 @@ def test_a_distance_in_one_piece_leaves_the_others_up_to_scale(freegeo, walk, ti
     assert len(scales) > 1 and any("--scale says nothing of the piece" in said for said in about["warnings"])
 
 
+@pytest.mark.slow
 def test_photos_in_an_order_of_their_own_are_described_once(freegeo, walk, tiny, tmp_path, oracle, truth, monkeypatch):
     described = []
     monkeypatch.setattr(
@@ -466,6 +468,7 @@ def test_photos_that_show_nothing_are_refused_when_there_are_no_others(freegeo, 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_still_is_said(freegeo, walk, tiny, tmp_path, oracle, truth):
     still = tmp_path / "still"
     still.mkdir()
@@ -475,6 +478,7 @@ def test_a_camera_that_stands_still_is_said(freegeo, walk, tiny, tmp_path, oracl
     assert "The photos 05.png to 13.png are the same picture" in outcome.err
 
 
+@pytest.mark.slow
 def test_a_photo_alone_beyond_a_cut_is_a_piece(freegeo, walk, tiny, tmp_path, oracle, monkeypatch):
     monkeypatch.setattr(sequence_job, "find_cuts", lambda *_: Jumps(cuts=[FRAMES - 1], doubtful=[]))
     outcome = freegeo("reconstruct", walk, "-o", tmp_path / "out", *tiny, *CHUNKS)
