@@ -546,17 +546,32 @@ def poses_of(T: torch.Tensor, *views: int) -> KnownCameras:
 def test_frames_between_known_poses_follow_them():
     """A path that drifts evenly away is the true one where its ends are known, and the known poses are exact."""
     true, frames = along(8), [0, 1, 3, 4, 5, 6, 8, 9]
-    known = poses_of(true, 1, 6)
+    known, drifted = poses_of(true, 1, 6), drifting(true, frames)
+    found = with_poses(drifted, [frames], known, 2.0, None)
+    np.testing.assert_array_equal(found.T_cam_world[[1, 6]], true[[1, 6]].numpy())
+    np.testing.assert_allclose(found.T_cam_world[1:7], true[1:7].numpy(), atol=1e-9)
+    assert found.scale is None and found.about["scale"] == 2
+    assert found.about["rotation_deg"] == pytest.approx(np.rad2deg(0.02 * 4.5), rel=1e-3)
+
+
+def test_no_frame_follows_a_known_pose_on_the_other_side_of_a_cut():
+    """Each part is as if it were alone; one without known poses stays where it was placed."""
+    true, frames = along(8), [0, 1, 3, 4, 5, 6, 8, 9]
+    known, drifted = poses_of(true, 1, 6), drifting(true, frames)
+    found = with_poses(drifted, [frames[:3], frames[3:5], frames[5:]], known, 1.0, None).T_cam_world
+    first = with_poses(drifted[:3], [frames[:3]], poses_of(true[:3], 1), 1.0, None).T_cam_world
+    last = with_poses(drifted[5:], [frames[5:]], poses_of(true[5:], 1), 1.0, None).T_cam_world
+    np.testing.assert_array_equal(found, np.concatenate((first, drifted[3:5], last)))
+
+
+def drifting(true: torch.Tensor, frames: list[int]) -> np.ndarray:
+    """Poses that leave the true ones evenly, frame by frame."""
     drifted = []
     for frame, T in zip(frames, true, strict=True):
         centre = camera_centres(T) + frame * torch.tensor([0.02, 0, 0.01], dtype=torch.float64)
         R = T[:3, :3] @ Sim3.exp(torch.tensor([0, 0.02 * frame, 0, 0, 0, 0, 0], dtype=torch.float64)).R
         drifted.append(from_Rt(R, -R @ centre))
-    found = with_poses(torch.stack(drifted).numpy(), frames, known, 2.0, None)
-    np.testing.assert_array_equal(found.T_cam_world[[1, 6]], true[[1, 6]].numpy())
-    np.testing.assert_allclose(found.T_cam_world[1:7], true[1:7].numpy(), atol=1e-9)
-    assert found.scale is None and found.about["scale"] == 2
-    assert found.about["rotation_deg"] == pytest.approx(np.rad2deg(0.02 * 4.5), rel=1e-3)
+    return torch.stack(drifted).numpy()
 
 
 def test_of_many_photos_only_those_with_known_poses_are_matched(monkeypatch):

@@ -274,7 +274,11 @@ class Tied:
 
 
 def with_poses(
-    T_cam_world: np.ndarray, frames: Sequence[int], known: KnownCameras, factor: float, scale: Scale | None
+    T_cam_world: np.ndarray,
+    stretches: Sequence[Sequence[int]],
+    known: KnownCameras,
+    factor: float,
+    scale: Scale | None,
 ) -> Tied:
     """Return known poses of some frames of a sequence as they were given, and let the frames between them follow.
 
@@ -284,19 +288,18 @@ def with_poses(
 
     Args:
         T_cam_world: (S, 4, 4) of the frames, placed in the world of the known poses.
-        frames: ascending numbers of these frames.
+        stretches: ascending numbers of these frames, in parts between which the sequence is cut: no frame follows a
+            known pose on the other side of a cut.
         known: of the frames, with the poses that are used.
         factor: by which placing them multiplied depth.
         scale: of the prediction.
     """
-    from scipy.spatial.transform import Rotation, Slerp
-
     rows = np.flatnonzero(known.has_pose)
     about = {"scale": factor, "rotation_deg": None, "position": None}
     metres = Scale(value=factor, source=f"the known cameras in {known.source}", spread=None) if known.metric else None
     if not len(rows):
         return Tied(T_cam_world=T_cam_world, scale=metres, about=about)
-    given, placed, T = _poses(known), torch.from_numpy(T_cam_world[rows]).double(), torch.from_numpy(T_cam_world)
+    given, placed = _poses(known), torch.from_numpy(T_cam_world[rows]).double()
     shift = camera_centres(given) - camera_centres(placed)
     longest = float(torch.cdist(camera_centres(given), camera_centres(given)).max())
     angle = torch.rad2deg(rotation_angle(placed[:, :3, :3], given[:, :3, :3]).quantile(0.5))
@@ -304,16 +307,33 @@ def with_poses(
     sim3 = replace(Sim3.identity(), s=torch.tensor(factor, dtype=torch.float64))
     fit = CameraFit(sim3=sim3, has_scale=True, spread=None, rotation_deg=float(angle), position=position)
     _doubt_poses(fit, known, scale)
+    moved = torch.from_numpy(T_cam_world.copy())
+    start = 0
+    for frames in stretches:
+        end = start + len(frames)
+        own = np.flatnonzero((rows >= start) & (rows < end))
+        if len(own):
+            moved[start:end] = _following(moved[start:end], frames, rows[own] - start, given[own])
+        start = end
+    about |= {"rotation_deg": float(angle), "position": position}
+    return Tied(T_cam_world=moved.numpy(), scale=metres, about=about)
+
+
+def _following(T_cam_world: Tensor, frames: Sequence[int], rows: np.ndarray, given: Tensor) -> Tensor:
+    """Poses of the frames of one stretch: those of `rows` as given, the others turned and shifted as these are."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    placed = T_cam_world[rows].double()
+    shift = camera_centres(given) - camera_centres(placed)
     # Before the first and after the last of them everything follows that one.
     around = np.concatenate(([0], np.arange(len(rows)), [len(rows) - 1]))
     times = [frames[0] - 1, *(frames[row] for row in rows), frames[-1] + 1]
     turns = Slerp(times, Rotation.from_matrix((given[:, :3, :3].mT @ placed[:, :3, :3]).numpy()[around]))(frames)
     shifts = np.stack([np.interp(frames, times, values) for values in shift.numpy()[around].T], axis=1)
-    R = T[:, :3, :3] @ torch.from_numpy(turns.as_matrix()).mT
-    moved = from_Rt(R, -(R @ (camera_centres(T) + torch.from_numpy(shifts))[..., None]).squeeze(-1))
+    R = T_cam_world[:, :3, :3] @ torch.from_numpy(turns.as_matrix()).mT
+    moved = from_Rt(R, -(R @ (camera_centres(T_cam_world) + torch.from_numpy(shifts))[..., None]).squeeze(-1))
     moved[rows] = given
-    about |= {"rotation_deg": float(angle), "position": position}
-    return Tied(T_cam_world=moved.numpy(), scale=metres, about=about)
+    return moved
 
 
 def is_measurable(posed: Posed, known: KnownCameras) -> bool:

@@ -756,7 +756,7 @@ class SequenceJob(Job):
         if not is_tied:
             return joined.T_cam_world, scale, about
         factor = float(np.median([float(member.sim3.s) for member in members]))
-        found = with_poses(joined.T_cam_world, frames, used, factor, scale)
+        found = with_poses(joined.T_cam_world, _uncut(frames, members), used, factor, scale)
         return found.T_cam_world, found.scale, about | dict(found.about)
 
     def _metres(
@@ -887,6 +887,17 @@ def _together(found: Refinement) -> dict[str, Any]:
 
 def _piece_label(number: int) -> str:
     return "" if number == 0 else f"piece {number + 1}: "
+
+
+def _uncut(frames: Sequence[int], members: Sequence[Member]) -> list[list[int]]:
+    """Split the frames of a piece where no chunk holds the last one and the next."""
+    together = {pair for member in members for pair in pairwise(member.chunk.frames)}
+    parts = [[frames[0]]]
+    for before, frame in pairwise(frames):
+        if (before, frame) not in together:
+            parts.append([])
+        parts[-1].append(frame)
+    return parts
 
 
 def _common_scale(members: Sequence[Member]) -> Scale | None:
