@@ -50,8 +50,9 @@ def write_ply(cloud: PointCloud, path: Path, *, lengths: str, normals: np.ndarra
         f"element vertex {len(rows)}", *(f"property float {name}" for name in _FLOATS),
         *(f"property uchar {name}" for name in _COLOURS), "end_header", "",
     ]  # fmt: skip
-    with files.atomic_path(path) as part:
-        part.write_bytes("\n".join(header).encode() + rows.tobytes())
+    with files.atomic_path(path) as part, part.open("wb") as file:
+        file.write("\n".join(header).encode())
+        file.write(rows.data)
     return path
 
 

@@ -26,9 +26,9 @@ class PointCloud:
     conf: np.ndarray
     """(n,) float32."""
     view: np.ndarray
-    """(n,) int64 index of the view."""
+    """(n,) int32 index of the view."""
     pixel: np.ndarray
-    """(n, 2) int64 column and row in the view's depth map."""
+    """(n, 2) int32 column and row in the view's depth map."""
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -100,8 +100,8 @@ def coloured_points(
         points=points,
         colours=images.reshape(-1, 3)[index],
         conf=conf.reshape(-1)[index].astype(np.float32),
-        view=view,
-        pixel=np.stack((column, row), axis=-1),
+        view=view.astype(np.int32),
+        pixel=np.stack((column, row), axis=-1).astype(np.int32),
     )
 
 
