@@ -55,6 +55,8 @@ SETS = {
     "all-16": [list(range(16))],
 }
 JUDGED = "seen-12"
+NOISE = 0.005
+"""True changes of a score up to this have no sign worth predicting."""
 METRICS = ("auc03", "auc05", "auc15", "auc30", "f1_rel5", "abs_rel")
 FROZEN = (1.0, 0.0)
 CANDIDATES = [FROZEN, *((1.0, s) for s in STRENGTHS), *((share, 1.0) for share in SHARES)]
@@ -248,17 +250,24 @@ def report(folder: Path) -> None:
     low = sum(mean < -0.003 for mean in means)
     print(f"\nOf {len(means)} means of the guard by domain {low} are below -.003, the least is {signed(min(means))}.")
     for score in ("s1", "s2", "s3", "s3-fixed", "s1b"):
-        ranks = (
-            f"{name} {metric} {_rank(rooms, score, name, metric):+.2f}"
+        told = {
+            f"{name} {metric}": agreement(rooms, score, name, metric)
             for name in ("seen-4", "seen-12", "all-16")
             for metric in ("auc30", "f1_rel5")
+        }
+        print(f"rank correlation of {score}:", ", ".join(f"{what} {rank:+.2f}" for what, (rank, _) in told.items()))
+        print(
+            f"same sign, of changes above {NOISE}:", ", ".join(f"{what} {same:.0%}" for what, (_, same) in told.items())
         )
-        print(f"rank correlation of {score}:", ", ".join(ranks))
     print(f"seconds a room: {np.mean([room.arrays['seconds'][1] for room in rooms]):.0f}")
 
 
-def _rank(rooms: list[Room], score: str, name: str, metric: str) -> float:
-    """Spearman correlation of a score's gain with the true gain, over rooms and candidates."""
+def agreement(rooms: list[Room], score: str, name: str, metric: str) -> tuple[float, float]:
+    """Compare a score's gain with the true gain, over rooms and candidates.
+
+    Returns:
+        Spearman correlation, and the share of the true changes above `NOISE` of which the score has the sign.
+    """
     from scipy.stats import spearmanr
 
     true, told = [], []
@@ -274,7 +283,8 @@ def _rank(rooms: list[Room], score: str, name: str, metric: str) -> float:
             if np.isfinite(change):
                 true.append(room.gain(candidate, name, metric))
                 told.append(change)
-    return float(spearmanr(true, told).statistic)
+    found, signs = np.array(true), np.sign(told) == np.sign(true)
+    return float(spearmanr(true, told).statistic), float(signs[np.abs(found) > NOISE].mean())
 
 
 def command_line(about: str, record: Callable[..., None], report: Callable[[Path], None], **more: float) -> None:
