@@ -16,7 +16,7 @@ import io
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -30,6 +30,7 @@ from freegeo.data.procedural import get_domain, photograph_room
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.dense import co_visible, depth_agreement
 from freegeo.evidence.features import Extractor, RootSift
+from freegeo.evidence.guard import Reference
 from freegeo.evidence.matches import MatchSettings, choose_pairs, find_matches
 from freegeo.evidence.scores import depth_scale, epipolar, off_edges, reprojection, two_view
 from freegeo.evidence.tracks import join_matches, triangulate
@@ -245,6 +246,8 @@ def main() -> None:
         "S6 triangulate": lambda: triangulate(candidate, matches, join_matches(matches)),
     }
     costs = {name: timed(call)[1] for name, call in scores.items()}
+    reference = Reference(candidate=candidate, matches=matches, keep=keep, common=fixed)
+    other = replace(candidate, depth_z=candidate.depth_z * 1.01)
     write_result(
         out,
         settings={
@@ -266,7 +269,7 @@ def main() -> None:
             if options.photos
             else round(epipolar(candidate, matches).median, 3),
             "scores of one candidate": costs,
-            "all scores": {key: round(sum(cost[key] for cost in costs.values()), 3) for key in ("wall_s", "cpu_s")},
+            "all that the guard measures of a candidate": timed(lambda: reference.measure(other))[1],
         },
         packages=packages,
     )

@@ -13,10 +13,12 @@ from freegeo.evidence.dense import (
     camera_difference,
     co_visible,
     depth_agreement,
+    depth_agreements,
     point_difference,
     stability,
 )
 from freegeo.evidence.matches import choose_pairs
+from freegeo.fusion.agreement import TOLERANCE_RANGE, tolerance_of
 from freegeo.geometry.depth import depth_to_world
 
 scene = cache(truth)
@@ -50,6 +52,27 @@ def test_errors_lower_the_agreement(spoil):
     assert shares == sorted(shares, reverse=True)
     assert ratios == sorted(ratios)
     assert shares[-1] < shares[0] - 0.1
+
+
+def test_several_sets_at_once_are_the_sets_one_by_one():
+    wrong = replace(scene(), T_cam_world=turned(scene().T_cam_world, 2))
+    sets = [fixed(), co_visible(wrong), replace(fixed(), tolerance=0.15)]
+    for together, alone in zip(
+        depth_agreements(wrong, sets), (depth_agreement(wrong, one) for one in sets), strict=True
+    ):
+        np.testing.assert_array_equal(together.pairs, alone.pairs)
+        np.testing.assert_array_equal(together.share, alone.share)
+        np.testing.assert_array_equal(together.log_ratio, alone.log_ratio)
+
+
+@pytest.mark.parametrize("error", [0.01, 0.02])
+def test_the_grid_gives_the_tolerance_that_all_pixels_give(error):
+    noise = error * torch.randn(scene().depth_z.shape, generator=torch.Generator().manual_seed(0))
+    noisy = replace(scene(), depth_z=scene().depth_z * (1 + noise))
+    usable = torch.ones_like(noisy.depth_z, dtype=torch.bool)
+    expected = tolerance_of(noisy.depth_z, noisy.T_cam_world.float(), noisy.K.float(), usable)
+    assert TOLERANCE_RANGE[0] < expected < TOLERANCE_RANGE[1]
+    assert co_visible(noisy).tolerance == pytest.approx(expected, rel=0.1)
 
 
 def test_world_frame_and_scale_do_not_matter():

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from freegeo.evidence.candidate import Candidate
-from freegeo.fusion.agreement import relative_slope, tolerance_of
+from freegeo.fusion.agreement import QUANTILE, TOLERANCE_NEIGHBOURS, nearest_views, relative_slope, tolerance_from
 from freegeo.geometry.depth import depth_to_world, valid_depth
 from freegeo.geometry.se3 import relative
 from freegeo.metrics.pose import area_under_curve, pair_errors
@@ -26,6 +26,7 @@ __all__ = [
     "camera_difference",
     "co_visible",
     "depth_agreement",
+    "depth_agreements",
     "point_difference",
     "stability",
 ]
@@ -109,7 +110,7 @@ def co_visible(candidate: Candidate, usable: Tensor | None = None) -> CoVisible:
     step = max(1, int(np.ceil(np.sqrt(height * width / SAMPLES))))
     grid = torch.arange(height * width, device=depth.device).view(height, width)
     grid = grid[step // 2 :: step, step // 2 :: step].flatten()
-    tolerance = tolerance_of(depth, *_cameras(candidate), known)
+    tolerance = _tolerance(candidate, known.flatten(1), grid)
     seen = []
     for source in range(len(depth)):
         expected, measured, _ = _meet(candidate, source, grid)
@@ -131,23 +132,30 @@ def depth_agreement(candidate: Candidate, fixed: CoVisible) -> DepthAgreement:
     The set and the tolerance come from one prediction (`co_visible`), so that a candidate gains nothing by moving
     surfaces out of sight: what misses the other image, or has no depth there, is a disagreement.
     """
+    return depth_agreements(candidate, [fixed])[0]
+
+
+def depth_agreements(candidate: Candidate, sets: Sequence[CoVisible]) -> list[DepthAgreement]:
+    """Return `depth_agreement` on several sets of the same grid of pixels, for little more than the cost of one."""
     depth = candidate.depth_z
     slope = relative_slope(torch.where(valid_depth(depth), depth, torch.nan)).flatten(1)
-    pairs = fixed.pairs
-    share, log_ratio = [], []
+    rows: list[list[Tensor]] = [[] for _ in sets]
     for source in range(len(depth)):
-        expected, measured, landed = _meet(candidate, source, fixed.pixel)
-        seen = fixed.seen[source]
+        expected, measured, landed = _meet(candidate, source, sets[0].pixel)
         log = (measured / expected).log().abs()
-        confirmed = log <= fixed.tolerance + slope.gather(1, landed)  # false for nan
+        beyond = log - slope.gather(1, landed)
         clipped = log.nan_to_num(LARGEST_LOG).clamp(max=LARGEST_LOG)
-        count = seen.sum(-1)
-        share.append((confirmed & seen).sum(-1) / count)
-        log_ratio.append((clipped * seen).sum(-1) / count)
-    values = torch.stack((torch.stack(share), torch.stack(log_ratio))).cpu().double().numpy()[:, *pairs.T]
-    return DepthAgreement(
-        pairs=pairs, share=values[0], log_ratio=values[1], reason=None if len(pairs) else _NOTHING_SHARED
-    )
+        for own, fixed in zip(rows, sets, strict=True):
+            seen = fixed.seen[source]
+            confirmed = beyond <= fixed.tolerance  # false for nan
+            own.append(torch.stack(((confirmed & seen).sum(-1), (clipped * seen).sum(-1))) / seen.sum(-1))
+    found = []
+    for own, fixed in zip(rows, sets, strict=True):
+        pairs = fixed.pairs
+        share, log_ratio = torch.stack(own, dim=1).cpu().double().numpy()[:, *pairs.T]
+        reason = None if len(pairs) else _NOTHING_SHARED
+        found.append(DepthAgreement(pairs=pairs, share=share, log_ratio=log_ratio, reason=reason))
+    return found
 
 
 def stability(candidate: Candidate, others: Sequence[tuple[Sequence[int], Candidate]]) -> list[Difference]:
@@ -218,21 +226,36 @@ def _cameras(candidate: Candidate) -> tuple[Tensor, Tensor]:
     return candidate.T_cam_world.to(candidate.depth_z), candidate.K.to(candidate.depth_z)
 
 
-def _meet(candidate: Candidate, source: int, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _tolerance(candidate: Candidate, known: Tensor, grid: Tensor) -> float:
+    """Return the tolerance of `tolerance_of` by the pixels (G,) of the grid alone; `known` (S, H W) may take part."""
+    found = []
+    for source, targets in enumerate(nearest_views(candidate.T_cam_world, TOLERANCE_NEIGHBOURS)):
+        expected, measured, landed = _meet(candidate, source, grid, targets)
+        usable = known[targets.to(known.device)].gather(1, landed) & known[source, grid]
+        found.append((measured / expected - 1).abs()[usable])
+    differences = torch.cat([candidate.depth_z.new_zeros(0), *found])
+    differences = differences[~differences.isnan()]
+    return tolerance_from(float(differences.quantile(QUANTILE)) if len(differences) else float("nan"))
+
+
+def _meet(
+    candidate: Candidate, source: int, pixels: Tensor, targets: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Depth (S, n) that every view should measure at the points of source pixels (n,), what it has there, and where.
 
-    The measured depth is nan where the point misses the image, lies behind the camera, or has no depth on either side;
-    the place is a flat index into the view's map, meaningless there.
+    With `targets` (t,), numbers of views, only these are asked (t, n). The measured depth is nan where the point misses
+    the image, lies behind the camera, or has no depth on either side; the place is a flat index into the view's map,
+    meaningless there.
     """
-    depth = candidate.depth_z
+    asked = candidate if targets is None else candidate.select(targets.tolist())
+    depth, own = asked.depth_z, candidate.depth_z[source].flatten()[pixels]
     height, width = depth.shape[1:]
     # Relative poses in double precision: a world frame far from the cameras costs no digits.
-    T = relative(candidate.T_cam_world[source], candidate.T_cam_world)
+    T = relative(candidate.T_cam_world[source], asked.T_cam_world)
     # From the source's pixels, times depth, to those of every view, in one product.
-    to_pixels = (candidate.K @ T[:, :3, :3] @ torch.linalg.inv(candidate.K[source])).to(depth)
-    shift = (candidate.K @ T[:, :3, 3:]).to(depth)
+    to_pixels = (asked.K @ T[:, :3, :3] @ torch.linalg.inv(candidate.K[source])).to(depth)
+    shift = (asked.K @ T[:, :3, 3:]).to(depth)
     place = torch.stack((pixels % width, pixels // width, torch.ones_like(pixels))).to(depth)
-    own = depth[source].flatten()[pixels]
     x, y, expected = (to_pixels @ (place * torch.where(valid_depth(own), own, torch.nan)) + shift).unbind(1)
     column, row = (x / expected + 0.5).floor(), (y / expected + 0.5).floor()
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & valid_depth(expected)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from freegeo.evidence.candidate import Candidate
-from freegeo.evidence.dense import CoVisible, co_visible, depth_agreement
+from freegeo.evidence.dense import CoVisible, co_visible, depth_agreements
 from freegeo.evidence.matches import Matches
 from freegeo.evidence.scores import PairScores, depth_scale, epipolar, off_edges, reprojection
 
@@ -209,7 +209,7 @@ class Reference:
         tolerance = min(own.tolerance, self.common.tolerance)
         sets = [replace(pixels, tolerance=tolerance) for pixels in (self.common, own)]
         after, before = (
-            sum(depth_agreement(one, pixels).mean_share for pixels in sets) / 2 for one in (candidate, self.candidate)
+            sum(found.mean_share for found in depth_agreements(one, sets)) / 2 for one in (candidate, self.candidate)
         )
         return after, before
 

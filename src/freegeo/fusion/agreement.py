@@ -24,6 +24,7 @@ __all__ = [
     "nearest_views",
     "prepare",
     "relative_slope",
+    "tolerance_from",
     "tolerance_of",
     "vote",
 ]
@@ -34,8 +35,9 @@ PREPARED = 32
 """Views whose prepared pixels are kept; neighbours in a sequence meet again within so many."""
 TOLERANCE_RANGE = (0.02, 0.15)
 """Range of the tolerance that `tolerance_of` estimates."""
-_QUANTILE, _SPREAD = 0.25, 8.0
-_TOLERANCE_NEIGHBOURS = 2
+QUANTILE, _SPREAD = 0.25, 8.0
+TOLERANCE_NEIGHBOURS = 2
+"""Views that a view's differences are measured to, for the tolerance."""
 _LARGEST_SLOPE = 0.2
 
 
@@ -240,7 +242,7 @@ def tolerance_of(depth_z: Tensor, T_cam_world: Tensor, K: Tensor, usable: Tensor
     lower bound; a network whose views disagree by some per cent is not filtered to nothing.
     """
     surfaces = prepare(depth_z, T_cam_world, K, usable, tolerance=0.0)
-    others = nearest_views(T_cam_world, _TOLERANCE_NEIGHBOURS).tolist()
+    others = nearest_views(T_cam_world, TOLERANCE_NEIGHBOURS).tolist()
 
     def differences() -> Iterator[np.ndarray]:
         for source, targets in enumerate(others):
@@ -248,6 +250,10 @@ def tolerance_of(depth_z: Tensor, T_cam_world: Tensor, K: Tensor, usable: Tensor
                 difference = look_up(surfaces, source, target).difference.abs()
                 yield difference[~difference.isnan()].cpu().numpy()
 
-    quartile = float(quantile(differences, _QUANTILE))
+    return tolerance_from(float(quantile(differences, QUANTILE)))
+
+
+def tolerance_from(quartile: float) -> float:
+    """Return the tolerance for a lower quartile of relative differences (`tolerance_of`); nan: nothing is compared."""
     low, high = TOLERANCE_RANGE
     return low if np.isnan(quartile) else min(max(_SPREAD * quartile, low), high)
