@@ -12,8 +12,8 @@ from freegeo.evidence.dense import (
     LARGEST_LOG,
     camera_difference,
     co_visible,
+    confirmed_share,
     depth_agreement,
-    depth_agreements,
     point_difference,
     stability,
 )
@@ -54,15 +54,14 @@ def test_errors_lower_the_agreement(spoil):
     assert shares[-1] < shares[0] - 0.1
 
 
-def test_several_sets_at_once_are_the_sets_one_by_one():
+@pytest.mark.parametrize("tolerance", [0.02, 0.1])
+def test_the_share_of_confirmed_pixels_is_that_of_the_agreement(tolerance):
     wrong = replace(scene(), T_cam_world=turned(scene().T_cam_world, 2))
-    sets = [fixed(), co_visible(wrong), replace(fixed(), tolerance=0.15)]
-    for together, alone in zip(
-        depth_agreements(wrong, sets), (depth_agreement(wrong, one) for one in sets), strict=True
-    ):
-        np.testing.assert_array_equal(together.pairs, alone.pairs)
-        np.testing.assert_array_equal(together.share, alone.share)
-        np.testing.assert_array_equal(together.log_ratio, alone.log_ratio)
+    own = co_visible(wrong)
+    for one, found in ((wrong, own), (scene(), fixed())):
+        for pixels in (fixed(), own):
+            expected = depth_agreement(one, replace(pixels, tolerance=tolerance)).mean_share
+            assert confirmed_share(found, pixels, tolerance) == expected
 
 
 @pytest.mark.parametrize("error", [0.01, 0.02])

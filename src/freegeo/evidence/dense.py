@@ -25,8 +25,8 @@ __all__ = [
     "Difference",
     "camera_difference",
     "co_visible",
+    "confirmed_share",
     "depth_agreement",
-    "depth_agreements",
     "point_difference",
     "stability",
 ]
@@ -46,6 +46,9 @@ class CoVisible:
     """(G,) int64 flat indices into a depth map, the same for all views."""
     seen: Tensor
     """(S, S, G) bool: whether the second view sees what the first has there; false for a view and itself."""
+    beyond: Tensor
+    """(S, S, G) by how much the second view's depth differs there from what the first's says, beyond the local slope:
+    log ratio; nan where it has none. A difference up to a tolerance confirms the first."""
     share: np.ndarray
     """(S, S) share of each view's known pixels that the other view sees, for `choose_pairs`."""
     tolerance: float
@@ -111,16 +114,20 @@ def co_visible(candidate: Candidate, usable: Tensor | None = None) -> CoVisible:
     grid = torch.arange(height * width, device=depth.device).view(height, width)
     grid = grid[step // 2 :: step, step // 2 :: step].flatten()
     tolerance = _tolerance(candidate, known.flatten(1), grid)
-    seen = []
+    slope = _slope(depth)
+    seen, beyond = [], []
     for source in range(len(depth)):
-        expected, measured, _ = _meet(candidate, source, grid)
+        expected, measured, landed = _meet(candidate, source, grid)
+        beyond.append((measured / expected).log().abs() - slope.gather(1, landed))
         seen.append((expected <= measured * (1 + tolerance)) & known[source].flatten()[grid])  # false for nan
         seen[-1][source] = False
-    everything = torch.stack(seen) if seen else depth.new_zeros((0, 0, len(grid)), dtype=torch.bool)
+    nothing = depth.new_zeros((0, 0, len(grid)))
+    everything = torch.stack(seen) if seen else nothing.bool()
     possible = known.flatten(1)[:, grid].sum(-1).clamp(min=1)
     return CoVisible(
         pixel=grid,
         seen=everything,
+        beyond=torch.stack(beyond) if beyond else nothing,
         share=(everything.sum(-1) / possible[:, None]).cpu().double().numpy(),
         tolerance=tolerance,
     )
@@ -132,30 +139,29 @@ def depth_agreement(candidate: Candidate, fixed: CoVisible) -> DepthAgreement:
     The set and the tolerance come from one prediction (`co_visible`), so that a candidate gains nothing by moving
     surfaces out of sight: what misses the other image, or has no depth there, is a disagreement.
     """
-    return depth_agreements(candidate, [fixed])[0]
-
-
-def depth_agreements(candidate: Candidate, sets: Sequence[CoVisible]) -> list[DepthAgreement]:
-    """Return `depth_agreement` on several sets of the same grid of pixels, for little more than the cost of one."""
     depth = candidate.depth_z
-    slope = relative_slope(torch.where(valid_depth(depth), depth, torch.nan)).flatten(1)
-    rows: list[list[Tensor]] = [[] for _ in sets]
+    slope = _slope(depth)
+    pairs = fixed.pairs
+    share, log_ratio = [], []
     for source in range(len(depth)):
-        expected, measured, landed = _meet(candidate, source, sets[0].pixel)
+        expected, measured, landed = _meet(candidate, source, fixed.pixel)
+        seen = fixed.seen[source]
         log = (measured / expected).log().abs()
-        beyond = log - slope.gather(1, landed)
+        confirmed = log <= fixed.tolerance + slope.gather(1, landed)  # false for nan
         clipped = log.nan_to_num(LARGEST_LOG).clamp(max=LARGEST_LOG)
-        for own, fixed in zip(rows, sets, strict=True):
-            seen = fixed.seen[source]
-            confirmed = beyond <= fixed.tolerance  # false for nan
-            own.append(torch.stack(((confirmed & seen).sum(-1), (clipped * seen).sum(-1))) / seen.sum(-1))
-    found = []
-    for own, fixed in zip(rows, sets, strict=True):
-        pairs = fixed.pairs
-        share, log_ratio = torch.stack(own, dim=1).cpu().double().numpy()[:, *pairs.T]
-        reason = None if len(pairs) else _NOTHING_SHARED
-        found.append(DepthAgreement(pairs=pairs, share=share, log_ratio=log_ratio, reason=reason))
-    return found
+        count = seen.sum(-1)
+        share.append((confirmed & seen).sum(-1) / count)
+        log_ratio.append((clipped * seen).sum(-1) / count)
+    values = torch.stack((torch.stack(share), torch.stack(log_ratio))).cpu().double().numpy()[:, *pairs.T]
+    return DepthAgreement(
+        pairs=pairs, share=values[0], log_ratio=values[1], reason=None if len(pairs) else _NOTHING_SHARED
+    )
+
+
+def confirmed_share(prediction: CoVisible, fixed: CoVisible, tolerance: float) -> float:
+    """Return `depth_agreement(...).mean_share` of a prediction, whose own pixels are given, on another's; cheap."""
+    confirmed = (prediction.beyond <= tolerance) & fixed.seen  # false for nan
+    return _mean((confirmed.sum(-1) / fixed.seen.sum(-1)).cpu().double().numpy())
 
 
 def stability(candidate: Candidate, others: Sequence[tuple[Sequence[int], Candidate]]) -> list[Difference]:
@@ -224,6 +230,11 @@ def _camera_difference(candidate: Candidate, T_cam_world: Tensor, K: Tensor) -> 
 def _cameras(candidate: Candidate) -> tuple[Tensor, Tensor]:
     """Return poses and intrinsics with the type and on the device of the depth."""
     return candidate.T_cam_world.to(candidate.depth_z), candidate.K.to(candidate.depth_z)
+
+
+def _slope(depth_z: Tensor) -> Tensor:
+    """Relative slope (S, H W) of depth maps (S, H, W), 0 where it is not known."""
+    return relative_slope(torch.where(valid_depth(depth_z), depth_z, torch.nan)).flatten(1)
 
 
 def _tolerance(candidate: Candidate, known: Tensor, grid: Tensor) -> float:

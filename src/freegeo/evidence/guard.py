@@ -15,9 +15,9 @@ from typing import Any, Literal
 import numpy as np
 
 from freegeo.evidence.candidate import Candidate
-from freegeo.evidence.dense import CoVisible, co_visible, depth_agreements
+from freegeo.evidence.dense import CoVisible, co_visible, confirmed_share
 from freegeo.evidence.matches import Matches
-from freegeo.evidence.scores import PairScores, depth_scale, epipolar, off_edges, reprojection
+from freegeo.evidence.scores import PairScores, carried, epipolar, off_edges
 
 __all__ = ["GuardSettings", "Measurement", "Reference", "State", "Trial", "Verdict", "judge", "states", "try_states"]
 
@@ -191,10 +191,11 @@ class Reference:
     def measure(self, candidate: Candidate) -> Measurement:
         """Score a prediction of the same photos."""
         agreement, before = self.compared_agreement(candidate)
+        ends = carried(candidate, self.matches, keep=self.keep)
         return Measurement(
             epipolar=epipolar(candidate, self.matches),
-            reprojection=reprojection(candidate, self.matches, keep=self.keep),
-            drift=depth_scale(candidate, self.matches, keep=self.keep).drift,
+            reprojection=ends.reprojection(),
+            drift=ends.depth_scale().drift,
             agreement=agreement,
             agreement_before=before,
         )
@@ -207,9 +208,9 @@ class Reference:
         """
         own = self.common if candidate is self.candidate else co_visible(candidate)
         tolerance = min(own.tolerance, self.common.tolerance)
-        sets = [replace(pixels, tolerance=tolerance) for pixels in (self.common, own)]
         after, before = (
-            sum(found.mean_share for found in depth_agreements(one, sets)) / 2 for one in (candidate, self.candidate)
+            sum(confirmed_share(one, pixels, tolerance) for pixels in (self.common, own)) / 2
+            for one in (own, self.common)
         )
         return after, before
 

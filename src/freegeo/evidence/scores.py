@@ -21,9 +21,11 @@ from freegeo.geometry.se3 import inverse, relative
 from freegeo.metrics.pose import area_under_curve
 
 __all__ = [
+    "Carried",
     "DepthScale",
     "PairAngles",
     "PairScores",
+    "carried",
     "depth_scale",
     "epipolar",
     "off_edges",
@@ -181,8 +183,7 @@ def reprojection(
             of this candidate (`off_edges`). Ends without known depth in this candidate are left out in any case.
         factor: all depths are multiplied by it.
     """
-    values, used = _medians(*_carried(candidate, matches, keep).errors(factor), len(matches.pairs))
-    return _pair_scores(matches, values, used, _NO_DEPTH)
+    return carried(candidate, matches, keep=keep).reprojection(factor)
 
 
 def depth_scale(candidate: Candidate, matches: Matches, *, keep: np.ndarray | None = None) -> DepthScale:
@@ -190,19 +191,7 @@ def depth_scale(candidate: Candidate, matches: Matches, *, keep: np.ndarray | No
 
     Depth and poses of a network can drift apart in scale while each of them looks better.
     """
-    from scipy.optimize import minimize_scalar
-
-    carried = _carried(candidate, matches, keep)
-
-    def error(factor: float) -> float:
-        return _mean(_medians(*carried.errors(factor), len(matches.pairs))[0])
-
-    start = error(1.0)
-    if np.isnan(start):
-        return DepthScale(factor=float("nan"), error_px=float("nan"), reason=matches.reason() or _NO_DEPTH)
-    found = minimize_scalar(error, bounds=FACTORS, method="bounded", options={"xatol": 5e-4})
-    best, factor = min((start, 1.0), (float(found.fun), float(found.x)))
-    return DepthScale(factor=factor, error_px=best, reason=None)
+    return carried(candidate, matches, keep=keep).depth_scale()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -297,9 +286,10 @@ def _known(depth_z: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Carried:
+class Carried:
     """Match ends with depth, in both directions, sorted by pair: a pixel with depth z lands at `turned` z + `shift`."""
 
+    matches: Matches
     turned: np.ndarray
     """(3, n) homogeneous matching pixels of the other view for each unit of depth."""
     shift: np.ndarray
@@ -309,15 +299,34 @@ class _Carried:
     pair: np.ndarray
     """(n,)."""
 
-    def errors(self, factor: float) -> tuple[np.ndarray, np.ndarray]:
-        """Distances (n,) with all depths times a factor, inf behind the other camera, and the pairs (n,)."""
+    def reprojection(self, factor: float = 1.0) -> PairScores:
+        """Return S2, as the function `reprojection`."""
+        return _pair_scores(self.matches, *self._medians(factor), _NO_DEPTH)
+
+    def depth_scale(self) -> DepthScale:
+        """Return S2g, as the function `depth_scale`."""
+        from scipy.optimize import minimize_scalar
+
+        def error(factor: float) -> float:
+            return _mean(self._medians(factor)[0])
+
+        start = error(1.0)
+        if np.isnan(start):
+            return DepthScale(factor=float("nan"), error_px=float("nan"), reason=self.matches.reason() or _NO_DEPTH)
+        found = minimize_scalar(error, bounds=FACTORS, method="bounded", options={"xatol": 5e-4})
+        best, factor = min((start, 1.0), (float(found.fun), float(found.x)))
+        return DepthScale(factor=factor, error_px=best, reason=None)
+
+    def _medians(self, factor: float) -> tuple[np.ndarray, np.ndarray]:
+        """Median distance (P,) of each pair with all depths times a factor, inf behind the other camera; and counts."""
         x, y, depth = self.turned * factor + self.shift
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.hypot(x / depth - self.wanted[0], y / depth - self.wanted[1])
-        return np.where(depth > 0, distance, np.inf), self.pair
+        return _medians(np.where(depth > 0, distance, np.inf), self.pair, len(self.matches.pairs))
 
 
-def _carried(candidate: Candidate, matches: Matches, keep: np.ndarray | None) -> _Carried:
+def carried(candidate: Candidate, matches: Matches, *, keep: np.ndarray | None = None) -> Carried:
+    """Carry match ends by a candidate's depth and cameras, once for both scores; arguments as `reprojection`."""
     z, smooth = _lifted(candidate, matches)
     usable = smooth if keep is None else torch.from_numpy(keep) & ~z.isnan()
     sides = _sides(candidate, matches)
@@ -330,7 +339,8 @@ def _carried(candidate: Candidate, matches: Matches, keep: np.ndarray | None) ->
         parts.append((turned, shift[pair], other[chosen], pair))
     turned, shift, wanted, pair = (torch.cat(values) for values in zip(*parts, strict=True))
     order = torch.argsort(pair, stable=True)
-    return _Carried(
+    return Carried(
+        matches=matches,
         turned=turned[order].T.numpy(),
         shift=shift[order].T.numpy(),
         wanted=wanted[order].T.numpy(),
