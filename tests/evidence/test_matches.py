@@ -1,5 +1,6 @@
 """Matches between rendered photos: right, repeatable, and absent without error where there is nothing to match."""
 
+from collections.abc import Sequence
 from functools import cache
 
 import cv2
@@ -260,27 +261,32 @@ def test_a_damaged_file_is_made_again(tmp_path, damage, caplog):
     assert load_matches(file) is not None
 
 
-def test_matches_of_overlapping_parts_are_those_of_the_whole():
-    whole, photos = found(), room().photos
-    parts = [find_matches([photos[view] for view in views]) for views in ([0, 1, 2, 3], [4, 3, 2])]
-    names = [photos[view].name for view in (4, 0, 2, 3)]
-    both = module.combined(parts, names)
-    wanted = [{0, 1, 2, 3}, {2, 3, 4}]
-    expected = {
-        frozenset(pair): whole.of_pair(number)
-        for number, pair in enumerate(whole.pairs.tolist())
-        if 1 not in pair and any(set(pair) <= views for views in wanted)
-    }
-    views = [(4, 0, 2, 3)[view] for view in range(4)]
-    assert {frozenset((views[a], views[b])) for a, b in both.pairs.tolist()} == set(expected)
-    for number, (a, b) in enumerate(both.pairs.tolist()):
-        ends = both.of_pair(number) if views[a] < views[b] else both.of_pair(number)[::-1]
-        rows = [np.unique(np.hstack(pair), axis=0) for pair in (ends, expected[frozenset((views[a], views[b]))])]
-        np.testing.assert_array_equal(*rows)
+def places(matches: Matches, numbers: Sequence[int]) -> dict[tuple[int, int], np.ndarray]:
+    """Places in the photos (M, 4) of the matches of each pair of photos, sorted; `numbers` are those of the photos."""
+    sets = {}
+    for number, (a, b) in enumerate(matches.pairs.tolist()):
+        pair = numbers[a], numbers[b]
+        ends = matches.of_pair(number) if pair[0] < pair[1] else matches.of_pair(number)[::-1]
+        sets[min(pair), max(pair)] = np.unique(np.hstack(ends), axis=0)
+    return sets
+
+
+def test_overlapping_parts_together_have_the_matches_of_each():
+    """Of a pair that both have, the first counts: verification draws at random, so that the second may differ."""
+    photos, views = room().photos, ([0, 1, 2, 3], [4, 3, 2])
+    parts = [find_matches([photos[view] for view in own]) for own in views]
+    both = module.combined(parts, [photos[view].name for view in (4, 0, 2, 3)])
+    first, second = (places(part, own) for part, own in zip(parts, views, strict=True))
+    assert first.keys() & second.keys() == {(2, 3)}
+    expected = {pair: ends for pair, ends in {**second, **first}.items() if 1 not in pair}
+    found = places(both, (4, 0, 2, 3))
+    assert found.keys() == expected.keys()
+    for pair, ends in found.items():
+        np.testing.assert_array_equal(ends, expected[pair])
     assert (
         len(np.unique(both.keypoints[both.view_start[2] : both.view_start[3]], axis=0)) == np.diff(both.view_start)[2]
     )
-    np.testing.assert_array_equal(both.photo_hw, whole.photo_hw[views])
+    np.testing.assert_array_equal(both.photo_hw, [photos[view].size_hw for view in (4, 0, 2, 3)])
     assert both.reason() is None and len(both.tried) >= len(both.pairs)
 
 
@@ -302,14 +308,19 @@ def test_more_photos_are_compared_with_those_that_see_most_of_the_same():
 
 
 def test_the_photos_order_decides_only_the_numbering():
-    backwards = find_matches(room().photos[::-1])
-    own = {tuple(pair): count for pair, count in zip(found().pairs.tolist(), found().counts, strict=True)}
-    other = {
-        (FRAMES - 1 - j, FRAMES - 1 - i): count
-        for (i, j), count in zip(backwards.pairs.tolist(), backwards.counts, strict=True)
-    }
-    assert own.keys() == other.keys()
-    assert all(abs(own[pair] - other[pair]) <= 0.05 * own[pair] + 1 for pair in own)
+    """But for what verification draws at random, which matches of little doubt survive."""
+    forth, back = found(), find_matches(room().photos[::-1])
+    numbers = range(FRAMES)
+    compared = [
+        {frozenset((own[a], own[b])): count for (a, b), count in zip(one.tried.tolist(), one.candidates, strict=True)}
+        for one, own in ((forth, numbers), (back, numbers[::-1]))
+    ]
+    assert compared[0] == compared[1]
+    one, two = places(forth, numbers), places(back, numbers[::-1])
+    assert one.keys() == two.keys()
+    for pair, ends in one.items():
+        own, other = ({tuple(row) for row in rows.tolist()} for rows in (ends, two[pair]))
+        assert len(own & other) > 0.8 * len(own | other)
 
 
 def test_one_photo_has_no_pairs_and_a_reason():
