@@ -54,7 +54,7 @@ ONCE_A_VIEW_SET = {
     "adaptation/losses/sampling.py:held_out_tokens",
     "adaptation/samples.py:Samples._in_file",
 }
-ONCE_AN_EPOCH = {"adaptation/adapt.py:_State.read_terms", "adaptation/losses/assemble.py:not_finite"}
+ONCE_AN_EPOCH = {"adaptation/adapt.py:_State.read_terms"}
 ONCE_A_STEP = {
     "disk": {f"types.py:{name}.to" for name in ("ViewTokens", "Features")} | {"adaptation/samples.py:Sample.to"},
     "device": set(),

@@ -95,14 +95,14 @@ def plain_adaptation(model, scenes, recipe, seed=42):
             with torch.no_grad(), adapter.off():
                 teacher = features(images)
             patch, special = teacher[max(teacher)]
+            levels, held_out = teacher_side(teacher, kept, recipe.loss)
             draws = draw_tokens(
                 recipe.loss,
                 tokens_per_view=patch.shape[2] + (special.shape[2] if recipe.loss.cross_tokens == "all" else 0),
                 student_views=len(kept),
-                held_out_views=len(images) - len(kept),
+                held_out=held_out.shape[1],
                 generator=torch.Generator().manual_seed(seed * 1_000_003 + step),
             )
-            levels, held_out = teacher_side(teacher, kept, recipe.loss)
             model.train(recipe.dropout > 0)
             loss, _ = adaptation_loss(features(images[kept]), levels, held_out, draws, recipe.loss)
             (loss * (1 / len(visits))).backward()

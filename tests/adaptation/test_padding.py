@@ -43,8 +43,8 @@ def loss_of(student, teacher, config, patches):
     held_out = held_out_tokens(teacher[3], KEPT, config, patches=patches)
     kept = None if patches is None else patches[KEPT]
     draws = draw_tokens(
-        config, tokens_per_view=teacher[3][0].shape[2] + special, student_views=4, held_out_views=4,
-        generator=torch.Generator().manual_seed(1), patches=kept, held_out_count=held_out.shape[1],
+        config, tokens_per_view=teacher[3][0].shape[2] + special, student_views=4, held_out=held_out.shape[1],
+        generator=torch.Generator().manual_seed(1), patches=kept,
     )  # fmt: skip
     student = {n: tuple(part.clone().requires_grad_() for part in level) for n, level in student.items()}
     kept_levels = {n: tuple(part[:, KEPT] for part in level) for n, level in teacher.items()}
@@ -101,7 +101,7 @@ def test_views_without_a_patch_in_common_are_refused():
     patches[:2, :12] = patches[2:, 12:] = True
     with pytest.raises(UserError, match="no patch in common"):
         draw_tokens(
-            RELEASED_DA3.loss, tokens_per_view=PATCHES, student_views=4, held_out_views=4,
+            RELEASED_DA3.loss, tokens_per_view=PATCHES, student_views=4, held_out=4 * PATCHES,
             generator=torch.Generator(), patches=patches,
         )  # fmt: skip
 

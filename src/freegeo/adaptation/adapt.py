@@ -22,7 +22,7 @@ from torch import Tensor
 
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.adapter_files import save_adapter
-from freegeo.adaptation.losses import CameraTargets, adaptation_loss, camera_loss, feature_distance, not_finite
+from freegeo.adaptation.losses import CameraTargets, adaptation_loss, camera_loss, feature_distance
 from freegeo.adaptation.memory import Plan, plan_adaptation
 from freegeo.adaptation.recipe import Recipe, require_seed
 from freegeo.adaptation.samples import Sample, Samples, SceneImages, loss_features, step_draws, step_seed
@@ -535,10 +535,12 @@ class _State:
         """Move the loss terms that are still on the device to the curve; DivergedError when they show a lost run."""
         curve = self.result.curve
         for step, terms in self.unread:
-            name = not_finite(terms)
-            if name is not None:
-                raise self._diverged(f"loss term {name} is not finite at step {step}")
-            curve.append({name: float(value) for name, value in terms.items() if name != "gradient"})
+            values = {name: float(value) for name, value in terms.items()}
+            for name, value in values.items():
+                if not math.isfinite(value):
+                    raise self._diverged(f"loss term {name} is not finite at step {step}")
+            values.pop("gradient", None)
+            curve.append(values)
             first, last = curve[0]["total"], curve[-1]["total"]
             if last > BLOWN_UP * first:
                 raise self._diverged(f"the loss has grown from {first:.3g} to {last:.3g} by step {step}")

@@ -377,11 +377,11 @@ def step_draws(sample: Sample, visit: Visit, config: LossConfig, *, seed: int) -
         config,
         tokens_per_view=patch.shape[2] + (special.shape[2] if config.cross_tokens == "all" else 0),
         student_views=len(visit.view_set.kept),
-        held_out_views=len(visit.view_set.frames) - len(visit.view_set.kept),
+        held_out=sample.held_out.shape[1],
         generator=torch.Generator().manual_seed(step_seed(seed, visit.step)),
         patches=sample.student_patches(),
-        held_out_count=sample.held_out.shape[1],
-    ).to(patch.device)
+        device=patch.device,
+    )
 
 
 def loaded_ahead(scenes: Sequence[SceneImages], requests: Iterable[tuple[int, Sequence[int]]]) -> Generator[Tensor]:
