@@ -819,12 +819,6 @@ def test_a_recipe_that_learns_cameras_refuses_a_sequence_in_chunks():
         run(model, [in_windows(12, range(4), range(4, 12))], evidence(model.spec))
 
 
-@pytest.mark.parametrize("window", [(0, 2, 1), (1, 1, 2), (-1, 0, 1), (7, 8, 9)])
-def test_windows_of_frames_that_are_not_there_are_refused(window):
-    with pytest.raises(ValueError, match="ascending numbers below 9"):
-        in_windows(9, (0, 1, 2), window)
-
-
 # -- a term of the user's own
 
 

@@ -131,14 +131,15 @@ def test_samples_know_which_patches_show_a_photo(place, hold, tmp_path):
     for visits in steps:
         for visit in visits:
             sample, frames = samples.take(visit), visit.view_set.frames
-            read = visit.view_set.positions if hold else visit.view_set.kept
+            read = range(len(frames)) if hold else visit.view_set.kept
             expected = torch.stack([middle if frames[p] in (1, 2, 6) else torch.ones_like(middle) for p in read])
             assert torch.equal(sample.patches, expected)
             held_out = [frame for p, frame in enumerate(frames) if p not in visit.view_set.kept]
             assert sample.held_out.shape[1] == sum(4 if frame in (1, 2, 6) else 16 for frame in held_out)
-            draws = step_draws(sample, visit, recipe.loss, seed=42).angle
-            assert sample.student_patches()[0][draws.reference].all()
-            assert sample.student_patches()[1:].flatten()[draws.query].all()
+            student = sample.student()
+            draws = step_draws(student, visit.step, recipe.loss, seed=42).angle
+            assert student.patches[0][draws.reference].all()
+            assert student.patches[1:].flatten()[draws.query].all()
     samples.close()
 
 
@@ -150,7 +151,7 @@ def test_the_mask_is_mirrored_with_the_images():
     mirrored = []
     for [visit] in steps:
         frames, kept = visit.view_set.frames, list(visit.view_set.kept)
-        found = samples.take(visit).student_patches()
+        found = samples.take(visit).student().patches
         pixels = released_augmentation(scene.inside[list(frames)][:, None].float(), visit.view_set.seed)[kept, 0]
         shown = torch.nn.functional.avg_pool2d((pixels > 0).float()[:, None], PATCH).flatten(1) >= 0.5
         if shown.all():

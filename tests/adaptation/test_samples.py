@@ -48,11 +48,11 @@ def test_a_sample_is_the_frozen_model_s_view_of_its_set(build, hold, place, tmp_
             sample, kept = samples.take(visit), list(visit.view_set.kept)
             tokens = embed_in_chunks(model, scene.load(visit.view_set.frames), device=CPU)
             levels = model.aggregate(tokens, layers=model.spec.loss_layers).levels
-            found, teacher = sample.student()
-            assert torch.equal(found.tokens, tokens.tokens[:, kept])
+            student = sample.student()
+            assert torch.equal(student.tokens.tokens, tokens.tokens[:, kept])
             for layer, (patch, special) in levels.items():
-                assert torch.equal(teacher[layer][0], patch[:, kept])
-                assert torch.equal(teacher[layer][1], special[:, kept])
+                assert torch.equal(student.teacher.levels[layer][0], patch[:, kept])
+                assert torch.equal(student.teacher.levels[layer][1], special[:, kept])
             assert torch.equal(sample.held_out, levels[max(levels)][0][:, 1::2].flatten(1, 2))
             assert sample.tokens.tokens.shape[1] == (8 if hold else 4)
     samples.close()

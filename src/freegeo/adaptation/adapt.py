@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -408,23 +408,22 @@ def _losses(run: _Run, adapter: Adapter, visit: Visit, sample: Sample) -> Genera
 
 def _student_loss(run: _Run, adapter: Adapter, visit: Visit, sample: Sample) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the losses of the student's views: features against the teacher's, cameras against the targets."""
-    recipe = run.recipe
-    tokens, teacher = sample.student()
+    recipe, sample = run.recipe, sample.student()
     with run.compute.autocast():
-        student = loss_features(adapter.model, tokens, sample.student_priors())
+        student = loss_features(adapter.model, sample.tokens, sample.priors)
     losses, terms = [], {}
     if recipe.features:
-        draws = step_draws(sample, visit, recipe.loss, seed=run.seed)
+        draws = step_draws(sample, visit.step, recipe.loss, seed=run.seed)
         loss, terms = adaptation_loss(
-            student.levels, teacher, sample.held_out, draws, recipe.loss, form=sample.form,
-            patches=sample.student_patches(),
+            student.levels, sample.teacher.levels, sample.held_out, draws, recipe.loss, form=sample.form,
+            patches=sample.patches,
         )  # fmt: skip
         losses.append(recipe.features * loss)
     if recipe.cameras:
-        losses.append(recipe.cameras * _camera_loss(adapter.model, student, sample.student_targets()))
+        losses.append(recipe.cameras * _camera_loss(adapter.model, student, sample.targets))
         terms["cameras"] = losses[-1].detach()
     if run.own_loss is not None:
-        losses.append(_checked(run.own_loss(student, replace(student, levels=teacher, extra={}))))
+        losses.append(_checked(run.own_loss(student, sample.teacher)))
         terms["own"] = losses[-1].detach()
     return torch.stack(losses).sum(), terms
 

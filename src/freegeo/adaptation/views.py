@@ -29,11 +29,6 @@ class ViewSet:
     """Positions in `frames` that the student sees."""
     seed: int
 
-    @property
-    def positions(self) -> tuple[int, ...]:
-        """Positions in `frames` that the teacher sees: all of them."""
-        return tuple(range(len(self.frames)))
-
 
 def chunk_windows(chunks: Sequence[Sequence[int]]) -> Windows:
     """Return the windows of a sequence in chunks: each chunk, and one across each seam of two chunks in a row.
