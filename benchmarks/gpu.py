@@ -198,9 +198,9 @@ def noise_scenes(count: int, frames: int, hw: tuple[int, int]):
 
 def adaptation_case(bench: Bench, model, scenes, recipe, found: dict, *, compute=None, **options) -> None:
     """Adapt once and note seconds of first and later steps, the peak, and the planner's prediction of it."""
-    from freegeo.adaptation.adapt import adapt, visited
+    from freegeo.adaptation.adapt import adapt
     from freegeo.adaptation.memory import Footprint, plan_adaptation
-    from freegeo.adaptation.views import schedule
+    from freegeo.adaptation.views import schedule, visited
 
     compute = compute or bench.compute
     steps = schedule([scene.count for scene in scenes], recipe, SEED)

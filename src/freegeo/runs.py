@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TypedDict, get_args
 import numpy as np
 from msgspec import Meta
 
-from freegeo.adaptation.adapt import require_unchanged_images
 from freegeo.adaptation.adapter_files import WEIGHTS, read_peft
 from freegeo.adaptation.memory import plan_reconstruction, require_adaptation_fits
-from freegeo.adaptation.recipe import SMALLEST_SCENE, Guard, Recipe
+from freegeo.adaptation.recipe import SMALLEST_SCENE, Guard, Recipe, require_unchanged_images
 from freegeo.cameras.undistortion import UndistortedPhoto
 from freegeo.data.photos import doubt_blank, some_of
 from freegeo.data.video import VideoFrame

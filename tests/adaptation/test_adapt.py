@@ -14,7 +14,8 @@ import torch
 from torch import nn
 
 from freegeo.adaptation import adapt as adapting
-from freegeo.adaptation.adapt import adapt, learning_rate, loss_change, trouble
+from freegeo.adaptation.adapt import adapt, learning_rate
+from freegeo.adaptation.adapted import loss_change, trouble
 from freegeo.adaptation.adapter import Adapter, PackedDropout, is_adapted
 from freegeo.adaptation.losses import adaptation_loss, draw_tokens, feature_distance
 from freegeo.adaptation.memory import Plan

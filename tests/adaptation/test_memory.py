@@ -9,12 +9,12 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from freegeo.adaptation import memory
-from freegeo.adaptation.adapt import adapt, visited
+from freegeo.adaptation.adapt import adapt
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.memory import Footprint, plan_adaptation, plan_reconstruction, shape_of
 from freegeo.adaptation.recipe import named, paper, scene
 from freegeo.adaptation.samples import Samples, SceneImages
-from freegeo.adaptation.views import schedule
+from freegeo.adaptation.views import schedule, visited
 from freegeo.errors import UserError
 from freegeo.models.api import embed_in_chunks
 from freegeo.models.catalog import build_empty

@@ -198,7 +198,7 @@ class Recipe:
                 raise UserError(f"recipe setting {name} must be 0 or more and finite, got {getattr(self, name)}.")
         if not (self.features or self.cameras):
             raise UserError("a recipe needs a weight of features or of cameras above 0.")
-        if self.cameras and (self.squash is not None or self.augmentation != "none"):
+        if self.cameras and self.changes_images:
             raise UserError("recipe setting cameras needs images as the model makes them: no squash, no augmentation.")
         for name in ("lr", "rank", "alpha", "batch", "sets_per_scene", "distinct_seeds", "clip"):
             if not 0 < getattr(self, name) < math.inf:
@@ -218,6 +218,11 @@ class Recipe:
     def sees_all(self) -> bool:
         """Whether a term compares what the adapted model says with all N views."""
         return bool(self.hold or self.cameras)
+
+    @property
+    def changes_images(self) -> bool:
+        """Whether images are mirrored or squashed, which known cameras do not follow."""
+        return self.squash is not None or self.augmentation != "none"
 
     def _check_keep(self, keep: tuple[int, ...]) -> None:
         listed = ",".join(map(str, keep))
@@ -284,6 +289,15 @@ def require_guard(guard: object) -> None:
     """Raise UserError for something that is no `Guard`."""
     if guard not in get_args(Guard):
         raise UserError(f"guard is {', '.join(get_args(Guard))}, not {guard!r}.")
+
+
+def require_unchanged_images(recipe: Recipe) -> None:
+    """Raise UserError for a recipe that cannot be used with known cameras."""
+    if recipe.changes_images:
+        raise UserError(
+            f"recipe '{recipe.name}' mirrors or squashes the images, and known cameras are of the photos as they are. "
+            "Choose another --recipe, such as scene, or leave the cameras out."
+        )
 
 
 class DatasetRow(NamedTuple):

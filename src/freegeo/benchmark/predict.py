@@ -15,10 +15,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from freegeo.adaptation import recipe as recipes
-from freegeo.adaptation.adapt import Progress
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.memory import plan_reconstruction
 from freegeo.adaptation.recipe import Recipe
+from freegeo.adaptation.state import Progress
 from freegeo.benchmark.adapters import AdapterJob, peak_memory_gb, reset_peak_memory, train, use
 from freegeo.benchmark.frames import require_truth
 from freegeo.benchmark.paper.variants import Variant, variant
