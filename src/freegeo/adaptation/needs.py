@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import torch
 
-from freegeo.adaptation.memory import Footprint, plan_reconstruction
+from freegeo.adaptation.memory import Footprint
 from freegeo.adaptation.recipe import scene
 from freegeo.models import catalog
 from freegeo.models.api import ReconstructionModel
+from freegeo.models.memory import plan_reconstruction
 from freegeo.models.precision import Compute
 from freegeo.models.spec import ModelEntry
 
