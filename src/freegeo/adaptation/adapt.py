@@ -177,23 +177,27 @@ def _learn(run: Run, state: State, visit: Visit, sample: Sample) -> dict[str, Te
     """Add the gradients of one view set, and return its share of the step's loss terms."""
     share = 1 / len(run.steps[visit.step])
     total, terms = torch.zeros((), device=run.compute.device), {}
-    for loss, parts in _losses(run, visit, sample):
+    for forward in _passes(run.recipe):
+        loss, parts = forward(run, visit, sample)
         state.scaler.scale(loss * share).backward()
         total = total + loss.detach()
         terms |= parts
     return {name: term * share for name, term in {**terms, "total": total}.items()}
 
 
-def _losses(run: Run, visit: Visit, sample: Sample) -> Generator[tuple[Tensor, dict[str, Tensor]]]:
-    """Yield the loss of each forward pass that the recipe needs, with its detached terms; `total` is their sum."""
-    yield _student_loss(run, visit, sample.student())
-    if run.recipe.sees_all:
-        yield _all_views_loss(run, sample)
+Pass = Callable[[Run, Visit, Sample], tuple[Tensor, dict[str, Tensor]]]
+"""A forward pass of the student: its loss, and the detached terms of that."""
+
+
+def _passes(recipe: Recipe) -> list[Pass]:
+    """Return the forward passes that a recipe needs; the total loss is the sum of theirs."""
+    return [_student_loss, _all_views_loss] if recipe.sees_all else [_student_loss]
 
 
 def _student_loss(run: Run, visit: Visit, sample: Sample) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the losses of the student's views: features against the teacher's, cameras against the targets."""
-    recipe, losses, terms = run.recipe, [], {}
+    recipe, sample = run.recipe, sample.student()
+    losses, terms = [], {}
     with run.compute.autocast():
         student = loss_features(run.model, sample.tokens, sample.priors)
     if recipe.features:
@@ -212,7 +216,7 @@ def _student_loss(run: Run, visit: Visit, sample: Sample) -> tuple[Tensor, dict[
     return torch.stack(losses).sum(), terms
 
 
-def _all_views_loss(run: Run, sample: Sample) -> tuple[Tensor, dict[str, Tensor]]:
+def _all_views_loss(run: Run, visit: Visit, sample: Sample) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the losses of all N views (not in the paper): features held where they were, cameras as above."""
     recipe, terms = run.recipe, {}
     with run.compute.autocast():
@@ -286,9 +290,9 @@ def _gain(run: Run, adapter: Adapter, samples: Samples) -> dict[str, float]:
     for visit in run.steps[-1]:
         sample = samples.take(visit)
         with adapter.off():
-            frozen += float(_student_loss(run, visit, sample.student())[0])
-            if run.recipe.cameras:  # else there is `hold` only, which is 0 for the frozen model
-                frozen += float(_all_views_loss(run, sample)[0])
-        adapted += sum(float(loss) for loss, _ in _losses(run, visit, sample))
+            # Without cameras the pass of all views gives `hold` only, which is 0 for the frozen model.
+            for forward in _passes(run.recipe) if run.recipe.cameras else [_student_loss]:
+                frozen += float(forward(run, visit, sample)[0])
+        adapted += sum(float(forward(run, visit, sample)[0]) for forward in _passes(run.recipe))
     count = len(run.steps[-1])
     return {"frozen": frozen / count, "adapted": adapted / count}

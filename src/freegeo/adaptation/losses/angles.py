@@ -36,7 +36,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from freegeo.adaptation.losses.numerics import block_elements, blocks, doubled, exact_matmul, widened_type
+from freegeo.adaptation.losses.numerics import block_elements, blocks, doubled, exact_matmul, widened
 
 ZERO_EPS = 64
 """A squared side counts as zero up to so many eps of the squared norms that it is a difference of."""
@@ -198,7 +198,7 @@ class _AngleTerms(torch.autograd.Function):
         delta: float | None,
     ) -> tuple[Tensor, Tensor]:
         ctx.dtypes = p.dtype, q.dtype
-        device, dtype = p.device, widened_type(p)
+        device, dtype = p.device, widened(p[:0]).dtype
         p, q, teacher_p, teacher_q, k = map(doubled, (p, q, teacher_p, teacher_q, k))
         centre = torch.cat([teacher_p, teacher_q, k.flatten(1, 2)], dim=1).mean(1, keepdim=True)
         with exact_matmul(p):
