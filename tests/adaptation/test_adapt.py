@@ -19,7 +19,7 @@ from freegeo.adaptation.adapted import loss_change, trouble
 from freegeo.adaptation.adapter import Adapter, PackedDropout, is_adapted
 from freegeo.adaptation.losses import adaptation_loss, draw_tokens, feature_distance
 from freegeo.adaptation.memory import Plan
-from freegeo.adaptation.recipe import evidence, paper, released
+from freegeo.adaptation.recipe import evidence, named
 from freegeo.adaptation.samples import SceneImages, released_augmentation
 from freegeo.adaptation.state import UNFINISHED_FILE
 from freegeo.adaptation.views import chunk_windows, schedule
@@ -125,10 +125,13 @@ CASES = {
     "da3-batch": (tiny_da3, lambda model: quick(model, epochs=2, batch=3)),
     "vggt-hold-batch": (tiny_vggt, lambda model: quick(model, epochs=2, batch=2, hold=0.5)),
     "da3-dropout-hold": (tiny_da3, lambda model: quick(model, steps=4, dropout=0.1, hold=1.0)),
-    "da3-paper": (tiny_da3, lambda model: paper(model.spec, "eth3d").changed(sets_per_scene=3, rank=4)),
-    "da3-released": (tiny_da3, lambda model: released("released-da3", "eth3d").changed(epochs=1, rank=2)),
+    "da3-paper": (tiny_da3, lambda model: named("paper", model.spec, "eth3d").changed(sets_per_scene=3, rank=4)),
+    "da3-released": (tiny_da3, lambda model: named("released-da3", model.spec, "eth3d").changed(epochs=1, rank=2)),
     "pi3-scene": (tiny_pi3, lambda model: quick(model, steps=5, hold=0.5)),
-    "vggt-released": (tiny_vggt, lambda model: released("released-vggt", "eth3d").changed(sets_per_scene=2, rank=2)),
+    "vggt-released": (
+        tiny_vggt,
+        lambda model: named("released-vggt", model.spec, "eth3d").changed(sets_per_scene=2, rank=2),
+    ),
 }
 
 
@@ -325,7 +328,7 @@ def test_a_default_precision_gives_way_to_the_recipe_s_on_a_gpu(monkeypatch):
 
     monkeypatch.setattr(adapting, "plan_adaptation", plan)
     model, cuda = tiny_da3(), torch.device("cuda")
-    recipe = paper(model.spec, "eth3d")
+    recipe = named("paper", model.spec, "eth3d")
     asked = Compute(device=cuda, precision="bf16")
     for compute, wanted in (
         (replace(asked, by_default=True), "fp16"),
@@ -685,7 +688,7 @@ def test_a_recipe_that_draws_anew_goes_on_to_the_same_end(tmp_path, monkeypatch)
     monkeypatch.setattr(adapting, "SAVE_EVERY_S", -1.0)
 
     def result(on_step=lambda progress: None, **options):
-        recipe = released("released-vggt", "eth3d").changed(epochs=3, sets_per_scene=2, rank=2, batch=1)
+        recipe = named("released-vggt", tiny_vggt().spec, "eth3d").changed(epochs=3, sets_per_scene=2, rank=2, batch=1)
         return run(tiny_vggt(), [noise_scene(9)], recipe, on_step=on_step, **options)
 
     def stop(progress):

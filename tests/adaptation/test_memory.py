@@ -10,7 +10,7 @@ from freegeo.adaptation import memory
 from freegeo.adaptation.adapt import adapt
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.memory import Footprint, plan_adaptation
-from freegeo.adaptation.recipe import named, paper, scene
+from freegeo.adaptation.recipe import named, scene
 from freegeo.adaptation.samples import Samples, SceneImages
 from freegeo.adaptation.views import schedule, visited
 from freegeo.errors import UserError
@@ -139,7 +139,7 @@ def test_samples_are_counted_to_the_byte(build, hold):
 def eth3d(budget_gb: float, name: str = "da3-giant", **changes):
     """The ETH3D-sized job: 11 scenes, 5 view sets each, 3 epochs, batch 4."""
     model = build_empty(name)
-    recipe = paper(model.spec, "eth3d").changed(sets_per_scene=5, **changes)
+    recipe = named("paper", model.spec, "eth3d").changed(sets_per_scene=5, **changes)
     scenes = [
         SceneImages(name=str(n), count=40, load=lambda f: torch.empty(len(f), 3, 518, 518, device="meta"))
         for n in range(11)

@@ -7,7 +7,7 @@ import torch
 
 from freegeo.adaptation.adapt import adapt
 from freegeo.adaptation.losses import adaptation_loss, draw_tokens, held_out_tokens
-from freegeo.adaptation.recipe import PAPER, RELEASED_DA3, RELEASED_VGGT, released
+from freegeo.adaptation.recipe import PAPER, RELEASED_DA3, RELEASED_VGGT, named
 from freegeo.adaptation.samples import Samples, SceneImages, released_augmentation, step_draws
 from freegeo.adaptation.views import schedule
 from freegeo.errors import UserError
@@ -145,7 +145,9 @@ def test_samples_know_which_patches_show_a_photo(place, hold, tmp_path):
 
 def test_the_mask_is_mirrored_with_the_images():
     model, scene = tiny_vggt(), padded_scene()
-    recipe = released("released-vggt", "eth3d").changed(epochs=1, sets_per_scene=6, distinct_seeds=6, rank=2, batch=1)
+    recipe = named("released-vggt", model.spec, "eth3d").changed(
+        epochs=1, sets_per_scene=6, distinct_seeds=6, rank=2, batch=1
+    )
     steps = schedule([scene.count], recipe, seed=0)
     samples = Samples(attach(model), [scene], recipe, steps, compute=Compute(), place="device", folder=None, seed=0)
     mirrored = []
