@@ -21,7 +21,7 @@ import torch
 from freegeo.adaptation.adapter import count_trainable
 from freegeo.adaptation.losses.numerics import CPU_BLOCK_ELEMENTS, DEVICE_BLOCK_ELEMENTS
 from freegeo.adaptation.recipe import SEED, Recipe
-from freegeo.adaptation.samples import Place, SceneImages, distinct, sample_key, view_keys
+from freegeo.adaptation.samples import Place, SampleKey, SceneImages, distinct, sample_key, view_keys
 from freegeo.adaptation.views import ViewSet, Visit, schedule
 from freegeo.errors import UserError
 from freegeo.host import gigabytes
@@ -213,18 +213,16 @@ class Footprint:
     @cached_property
     def _kept_peak(self) -> int:
         """Most bytes of samples kept at one time: each is kept from its first visit to its last."""
-        left = Counter(sample_key(view_set, self.recipe) for view_set in self.visits)
-        kept: dict = {}
-        size = peak = 0
-        for view_set in self.visits:
-            key = sample_key(view_set, self.recipe)
-            left[key] -= 1
-            if left[key] and key not in kept:
+        keys = [sample_key(view_set, self.recipe) for view_set in self.visits]
+        last = {key: number for number, key in enumerate(keys)}
+        kept: dict[SampleKey, int] = {}
+        peak = 0
+        for number, (key, view_set) in enumerate(zip(keys, self.visits, strict=True)):
+            if number < last[key]:
                 kept[key] = self._sample(view_set)
-                size += kept[key]
-            elif not left[key]:
-                size -= kept.pop(key, 0)
-            peak = max(peak, size)
+            else:
+                kept.pop(key, None)
+            peak = max(peak, sum(kept.values()))
         return peak
 
     def _sample(self, view_set: ViewSet) -> int:

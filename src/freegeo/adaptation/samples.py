@@ -224,7 +224,7 @@ class Samples:
         if place == "disk":
             home = tempfile.mkdtemp(prefix="freegeo-samples-") if folder is None else scratch_folder(folder, "samples")
             self._folder = Path(home)
-        self._tokens = self._embedded(scenes, distinct(view_sets, recipe))
+        self._tokens = self._embedded(distinct(view_sets, recipe))
 
     def take(self, visit: Visit) -> Sample:
         """Return the sample of a visit, on the device; visits come in the order of `steps`."""
@@ -277,7 +277,7 @@ class Samples:
         spread = teacher_spread(levels[max(levels)], sample.held_out, draws, config)
         return replace(sample, form=choose_form(float(spread), headroom=SPREAD_HEADROOM))
 
-    def _embedded(self, scenes: Sequence[SceneImages], view_sets: Sequence[ViewSet]) -> Generator[ViewTokens]:
+    def _embedded(self, view_sets: Sequence[ViewSet]) -> Generator[ViewTokens]:
         """Yield the tokens (1, N, ...) of view sets in order; an image that several sets use is embedded once."""
         fresh, left = [], Counter[ViewKey]()
         for view_set in view_sets:
@@ -287,7 +287,7 @@ class Samples:
         requests = [(s.scene, [s.frames[p] for p in positions]) for s, positions in zip(view_sets, fresh, strict=True)]
         device, layers = self._compute.device, self._adapter.model.spec.loss_layers
         waiting: dict[ViewKey, ViewTokens] = {}
-        with closing(loaded_ahead(scenes, [request for request in requests if request[1]])) as images:
+        with closing(loaded_ahead(self._scenes, [request for request in requests if request[1]])) as images:
             for view_set, positions in zip(view_sets, fresh, strict=True):
                 keys = view_keys(view_set, self._recipe)
                 if positions:

@@ -187,10 +187,10 @@ def _all_pairs(
     """Every reference (or every anchor of every reference) with every query."""
     student, teacher = _pooled(student), _pooled(teacher)
     if name == "kl_kq":
-        k = anchors.flatten(1, 2)
-        student, teacher = (k, student[1]), (k, teacher[1])
-        if config.kq_order == "qk":
-            student, teacher = student[::-1], teacher[::-1]
+        # In the order "qk" q - k is taken as -k - (-q): both branches share the first tokens, which saves a product.
+        turned = config.kq_order == "qk"
+        k, q, teacher_q = (-t if turned else t for t in (anchors.flatten(1, 2), student[1], teacher[1]))
+        student, teacher = (k, q), (k, teacher_q)
     kl = all_pairs_divergence(student, teacher, temperature=config.temperature, form=form)
     return _outer(kl, config).mean()
 
