@@ -23,9 +23,10 @@ from freegeo.adaptation.losses import CameraTargets, adaptation_loss, camera_los
 from freegeo.adaptation.memory import Plan, plan_adaptation
 from freegeo.adaptation.recipe import Recipe, require_seed, require_unchanged_images
 from freegeo.adaptation.samples import Sample, Samples, SceneImages, loss_features, step_draws, step_seed
-from freegeo.adaptation.state import OwnLoss, Progress, Run, State, undisturbed
+from freegeo.adaptation.state import OwnLoss, Progress, Run, State
 from freegeo.adaptation.views import Visit, announced_schedule, visited
 from freegeo.errors import FreeGeoError, UserError
+from freegeo.host import signals_held
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
 from freegeo.types import Features
@@ -164,7 +165,7 @@ def _steps(run: Run, state: State, samples: Samples) -> None:
         with _training(run, step):
             parts = [_learn(run, state, visit, samples.take(visit)) for visit in steps[step]]
         terms = {name: torch.stack([part[name] for part in parts]).sum() for name in parts[0]}
-        with undisturbed():
+        with signals_held():
             state.update(terms, learning_rate(step, len(steps), run.recipe))
         run.on_step(Progress(step=step, steps=len(steps), epoch=steps[step][0].epoch, terms=terms))
         _end_epoch(run, state, step)

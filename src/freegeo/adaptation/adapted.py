@@ -106,9 +106,7 @@ def trouble(gain: Mapping[str, float], broken: Sequence[str], recipe: Recipe) ->
     """Say in one sentence why a finished adapter should not be used, and what to do; None where it may be.
 
     The rule compares like with like: the same view sets and tokens, without the adapter and with it, after the last
-    update. The loss curve cannot decide. Its start and end are of different view sets, whose losses differ by more than
-    a short run gains, so that good runs seem to rise; a run that blows up at once has its worst losses at the start, so
-    that it seems to fall; and it lacks the last update, which in a run of one step is all there is.
+    update. Why the loss curve cannot decide that: docs/method.md, "Schedule and optimiser".
 
     Args:
         gain: `Adapted.gain`.

@@ -10,11 +10,8 @@ import hashlib
 import json
 import logging
 import math
-import signal
-import threading
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
@@ -299,26 +296,3 @@ def _damaged(path: Path, reason: str) -> UserError:
 def remove_state(folder: Path) -> None:
     """Remove the state of a run that is finished."""
     remove_file(folder / UNFINISHED_FILE)
-
-
-@contextmanager
-def undisturbed() -> Generator[None]:
-    """Let Ctrl-C (and SIGTERM, where the program handles it) wait until the block has ended.
-
-    An optimiser step inside is taken wholly or not at all, so the state after it can be saved at any time.
-    """
-    if threading.current_thread() is not threading.main_thread():  # Signals reach the main thread only.
-        yield
-        return
-    waiting: list[Any] = []
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    handlers = {number: handler for number, handler in handlers.items() if callable(handler)}
-    for number in handlers:
-        signal.signal(number, lambda *arguments: waiting.append(arguments))
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        for number, frame in waiting:
-            handlers[number](number, frame)
