@@ -198,9 +198,9 @@ def noise_scenes(count: int, frames: int, hw: tuple[int, int]):
 
 def adaptation_case(bench: Bench, model, scenes, recipe, found: dict, *, compute=None, **options) -> None:
     """Adapt once and note seconds of first and later steps, the peak, and the planner's prediction of it."""
-    from freegeo.adaptation.adapt import adapt, visited
+    from freegeo.adaptation.adapt import adapt
     from freegeo.adaptation.memory import Footprint, plan_adaptation
-    from freegeo.adaptation.views import schedule
+    from freegeo.adaptation.views import schedule, visited
 
     compute = compute or bench.compute
     steps = schedule([scene.count for scene in scenes], recipe, SEED)
@@ -335,7 +335,7 @@ def reconstruct(bench: Bench) -> None:
 
 def reconstruct_model(bench: Bench, model, name: str, hw: tuple[int, int], counts: tuple[int, ...]) -> None:
     """The same for one model and some numbers of views."""
-    from freegeo.adaptation.memory import plan_reconstruction
+    from freegeo.models.memory import plan_reconstruction
     from freegeo.pipeline import predict
 
     for views in counts:
@@ -394,7 +394,7 @@ def saved(bench: Bench) -> None:
     import torch
 
     from freegeo.adaptation.adapter import Adapter
-    from freegeo.adaptation.memory import shape_of
+    from freegeo.models.memory import shape_of
 
     for name in (BIG, OTHER, MIDDLE):
         model = bench.model(name)

@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.losses import LossConfig, StepDraws, TokenDraw, draw_tokens
-from freegeo.adaptation.recipe import Recipe
+from freegeo.adaptation.losses import StepDraws, TokenDraw, draw_tokens
+from freegeo.adaptation.recipe import LossConfig, Recipe
 from freegeo.models.api import ReconstructionModel
 from freegeo.models.precision import Compute
 
@@ -130,9 +130,10 @@ class PlainAdaptation:
             config,
             tokens_per_view=student[layers[-1]].shape[1],
             student_views=len(kept),
-            held_out_views=images.shape[1] - len(kept),
+            held_out=(images.shape[1] - len(kept)) * student[layers[-1]].shape[1],
             generator=torch.Generator().manual_seed(self.seed * 1_000_003 + step),
-        ).to(images.device)
+            device=images.device,
+        )
         loss = torch.stack([intra(student[i], teacher[i][list(kept)], config) for i in layers]).mean()
         loss = loss + relational(student[layers[-1]], teacher[layers[-1]], kept, draws, config)
         self.optimiser.zero_grad()

@@ -15,13 +15,12 @@ from torch import Tensor
 
 from fixture_tools import DEVICE
 from freegeo.adaptation.losses import (
-    LossConfig,
     StepDraws,
     TokenDraw,
     adaptation_loss,
 )
 from freegeo.adaptation.losses.sampling import anchor_positions
-from freegeo.adaptation.recipe import PAPER, RELEASED_DA3, RELEASED_VGGT
+from freegeo.adaptation.recipe import PAPER, RELEASED_DA3, RELEASED_VGGT, LossConfig
 from loss_tools import teacher_side
 
 Levels = dict[int, tuple[Tensor, Tensor]]

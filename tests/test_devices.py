@@ -45,7 +45,7 @@ ONCE_A_RUN = {
     "adaptation/adapt.py:_train",  # the model moves to the device
     "adaptation/adapter.py:Adapter.attach",
     "adaptation/adapter.py:_draw_start",
-    "adaptation/adapt.py:_State.update",  # the guard's states of the adapter
+    "adaptation/state.py:State.update",  # the guard's states of the adapter
     "models/images.py:_statistics",
 }
 ONCE_A_VIEW_SET = {
@@ -54,7 +54,7 @@ ONCE_A_VIEW_SET = {
     "adaptation/losses/sampling.py:held_out_tokens",
     "adaptation/samples.py:Samples._in_file",
 }
-ONCE_AN_EPOCH = {"adaptation/adapt.py:_State.read_terms", "adaptation/losses/assemble.py:not_finite"}
+ONCE_AN_EPOCH = {"adaptation/state.py:State.read_terms"}
 ONCE_A_STEP = {
     "disk": {f"types.py:{name}.to" for name in ("ViewTokens", "Features")} | {"adaptation/samples.py:Sample.to"},
     "device": set(),

@@ -364,11 +364,11 @@ def test_teacher_and_student_are_told_the_cameras_of_their_views(photos, hold):
         teacher = model.aggregate(tokens, layers=layers, priors=scene.priors.select(frames)).levels
         without = model.aggregate(tokens, layers=layers).levels
         for layer in layers:
-            assert torch.allclose(sample.student()[1][layer][0], teacher[layer][0][:, kept], atol=1e-5)
+            assert torch.allclose(sample.student().teacher.levels[layer][0], teacher[layer][0][:, kept], atol=1e-5)
         assert not torch.allclose(teacher[layers[-1]][0], without[layers[-1]][0], atol=1e-3)
         # The student's own first view is the reference of its cameras.
         chosen = [frames[k] for k in kept]
-        assert torch.equal(sample.student_priors().T_cam_world, scene.priors.T_cam_world[:, chosen])
+        assert torch.equal(sample.student().priors.T_cam_world, scene.priors.T_cam_world[:, chosen])
     samples.close()
 
 

@@ -11,7 +11,7 @@ import rich.console
 import torch
 
 from freegeo import progress
-from freegeo.adaptation.adapt import Progress
+from freegeo.adaptation.state import Progress
 
 
 def test_progress_without_a_terminal_is_a_line_per_tenth(capsys):

@@ -13,12 +13,13 @@ from PIL import Image
 
 import freegeo
 from freegeo import runs
-from freegeo.adaptation import memory
+from freegeo.adaptation import memory as adaptation_memory
 from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapter import is_adapted
 from freegeo.adaptation.adapter_files import load_adapter, save_adapter
 from freegeo.errors import UserError
 from freegeo.files import atomic_path, write_json
+from freegeo.models import memory as models_memory
 from freegeo.models.checkpoints import fingerprint_of
 from freegeo.run_folder import run_folder
 from tiny_models import attach, noise, quick, same, tiny_da3, tiny_nested, tiny_vggt
@@ -122,7 +123,8 @@ def test_nothing_is_removed_for_a_run_that_is_refused(monkeypatch, tmp_path, rea
     wish: dict = {} if read != "too much memory" else {"recipe": "scene"}
     if wish:
         free = iter((10**9, 10**5))  # to predict, and to adapt
-        monkeypatch.setattr(memory, "available", lambda device, model: next(free))
+        for planner in (models_memory, adaptation_memory):
+            monkeypatch.setattr(planner, "available", lambda device, model: next(free))
     before = contents(out)
     refused = r"--overwrite would remove it|made for tiny-vggt|belongs to another model|adapting tiny-da3 needs"
     with pytest.raises(UserError, match=refused):

@@ -184,6 +184,13 @@ def _spec(name: str, layers: tuple[int, ...], special: int, reference: str = "fi
     )  # fmt: skip
 
 
+def parts_of(value) -> list[Tensor]:
+    """Return the tensors of tokens, features or a sample, in a fixed order."""
+    found: list[Tensor] = []
+    value.map(lambda tensor: found.append(tensor) or tensor)
+    return found
+
+
 def tensors(result) -> list[torch.Tensor]:
     """The tensors of a finished run's adapter."""
     return [parameter.detach() for parameter in result.adapter.parameters()]

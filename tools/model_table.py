@@ -7,7 +7,7 @@ import re
 import sys
 from pathlib import Path
 
-from freegeo.adaptation.needs import VIEWS, needs_of
+from freegeo.cli.models import VIEWS, needs_of
 from freegeo.models import catalog
 from freegeo.models.spec import ModelEntry, ModelSpec
 

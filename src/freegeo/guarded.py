@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from freegeo.adaptation.adapt import Adapted
+from freegeo.adaptation.adapted import Adapted
 from freegeo.evidence.candidate import Candidate
 from freegeo.evidence.dense import co_visible
 from freegeo.evidence.guard import Reference, State, Verdict, try_states

@@ -112,6 +112,29 @@ def _wait_for_parent() -> None:
 
 
 @contextmanager
+def signals_held() -> Generator[None]:
+    """Let Ctrl-C (and SIGTERM, where the program handles it) wait until the block has ended.
+
+    What is inside, such as a step of an optimiser, is done wholly or not at all.
+    """
+    if threading.current_thread() is not threading.main_thread():  # Signals reach the main thread only.
+        yield
+        return
+    waiting: list[Any] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: handler for number, handler in handlers.items() if callable(handler)}
+    for number in handlers:
+        signal.signal(number, lambda *arguments: waiting.append(arguments))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number, frame in waiting:
+            handlers[number](number, frame)
+
+
+@contextmanager
 def sigterm_kept() -> Generator[None]:
     """Keep this process's answer to SIGTERM while a library is imported that puts a handler of its own there."""
     before = signal.getsignal(signal.SIGTERM)

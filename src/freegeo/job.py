@@ -17,13 +17,13 @@ import torch
 
 from freegeo import __version__
 from freegeo.adaptation import adapter_files
-from freegeo.adaptation.adapt import Adapted, Progress, loss_change
 from freegeo.adaptation.adapt import adapt as train_adapter
+from freegeo.adaptation.adapted import Adapted, loss_change
 from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.adapter_files import ADAPTER_FOLDER, METADATA
 from freegeo.adaptation.recipe import SEED, Guard, Recipe
 from freegeo.adaptation.samples import SceneImages
-from freegeo.adaptation.state import remove_state
+from freegeo.adaptation.state import Progress, remove_state
 from freegeo.errors import DivergedError, NoEvidenceError
 from freegeo.evidence.guard import SHARES
 from freegeo.export.base import DEFAULT_FORMATS, TRACKS_NAME, Before, DepthSize

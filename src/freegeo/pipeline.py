@@ -15,12 +15,12 @@ import torch
 
 from freegeo.adaptation import adapter_files
 from freegeo.adaptation import recipe as recipes
-from freegeo.adaptation.adapt import Adapted, OwnLoss, Progress
 from freegeo.adaptation.adapt import adapt as train_adapter
+from freegeo.adaptation.adapted import Adapted
 from freegeo.adaptation.adapter import Adapter, is_adapted
-from freegeo.adaptation.memory import plan_reconstruction
 from freegeo.adaptation.recipe import SEED, SMALLEST_SCENE, Guard, Recipe, require_guard
 from freegeo.adaptation.samples import SceneImages
+from freegeo.adaptation.state import OwnLoss, Progress
 from freegeo.data.photos import MAX_VIEWS, load_photos
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.evidence.bundle import pycolmap_module
@@ -32,6 +32,7 @@ from freegeo.metres import in_metres, read_scale
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import caution_of
 from freegeo.models.images import read_photos
+from freegeo.models.memory import plan_reconstruction
 from freegeo.models.precision import Compute
 from freegeo.models.spec import MIXED, Mixed, ModelSpec, PoseFrom
 from freegeo.posed import (

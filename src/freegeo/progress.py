@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from freegeo.adaptation.adapt import Progress
+    from freegeo.adaptation.state import Progress
 
 Update = Callable[..., None]
 LINES = 10

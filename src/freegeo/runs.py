@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TypedDict, get_args
 import numpy as np
 from msgspec import Meta
 
-from freegeo.adaptation.adapt import require_unchanged_images
 from freegeo.adaptation.adapter_files import WEIGHTS, read_peft
-from freegeo.adaptation.memory import plan_reconstruction, require_adaptation_fits
-from freegeo.adaptation.recipe import SMALLEST_SCENE, Guard, Recipe
+from freegeo.adaptation.memory import require_adaptation_fits
+from freegeo.adaptation.recipe import SMALLEST_SCENE, Guard, Recipe, require_unchanged_images
 from freegeo.cameras.undistortion import UndistortedPhoto
 from freegeo.data.photos import doubt_blank, some_of
 from freegeo.data.video import VideoFrame
@@ -34,6 +33,7 @@ from freegeo.job import MATCHES_NAME, PARTS, SUMMARY_NAME, Job
 from freegeo.metres import read_scale, require_in_view
 from freegeo.models.checkpoints import fingerprint
 from freegeo.models.images import look_at_photos, read_photos, read_some
+from freegeo.models.memory import plan_reconstruction
 from freegeo.models.precision import Compute
 from freegeo.models.spec import MIXED, Mixed, ModelSpec, PoseFrom
 from freegeo.pipeline import require_reference

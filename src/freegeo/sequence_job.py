@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 
 from freegeo import files
-from freegeo.adaptation.adapt import Adapted
+from freegeo.adaptation.adapted import Adapted
 from freegeo.adaptation.views import chunk_windows
 from freegeo.data.photos import some_of
 from freegeo.data.video import VideoFrame

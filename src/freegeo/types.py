@@ -6,15 +6,13 @@ Letters: B batch, S views, H W pixels, P patches, N tokens, T special tokens, C 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal, Protocol, Self
 
 import numpy as np
 import torch
 from torch import Tensor
-
-_META_KEYS = ("image_hw", "grid_hw")
 
 
 class PhotoLike(Protocol):
@@ -126,8 +124,7 @@ class ViewTokens:
 
     def select(self, views: Sequence[int]) -> Self:
         """Return the chosen views, in the order given."""
-        extra = {name: _views(value, views) for name, value in self.extra.items()}
-        return replace(self, tokens=_views(self.tokens, views), extra=extra)
+        return self.map(lambda tensor: _views(tensor, views))
 
     @classmethod
     def join_views(cls, parts: Sequence[ViewTokens]) -> ViewTokens:
@@ -140,17 +137,12 @@ class ViewTokens:
 
     def to(self, *args, **kwargs) -> Self:
         """Move or cast all tensors, with the arguments of `Tensor.to`."""
-        extra = {name: value.to(*args, **kwargs) for name, value in self.extra.items()}
-        return replace(self, tokens=self.tokens.to(*args, **kwargs), extra=extra)
+        return self.map(lambda tensor: tensor.to(*args, **kwargs))
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Return everything as named tensors, for a cache or a file."""
-        return {"tokens": self.tokens, **_meta_tensors(self), **_extra_tensors(self)}
-
-    @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
-        """Rebuild what `tensors` returned."""
-        return cls(tokens=tensors["tokens"], extra=_read_extra(tensors), **_read_meta(tensors))
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """Apply `change` to every tensor."""
+        extra = {name: change(value) for name, value in self.extra.items()}
+        return replace(self, tokens=change(self.tokens), extra=extra)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,49 +159,21 @@ class Features:
 
     def select(self, views: Sequence[int]) -> Self:
         """Return the chosen views, in the order given ("8->4" is `select([0, 2, 4, 6])`)."""
-        return self._map(lambda t: _views(t, views))
+        return self.map(lambda tensor: _views(tensor, views))
 
     def to(self, *args, **kwargs) -> Self:
         """Move or cast all tensors, with the arguments of `Tensor.to`."""
-        return self._map(lambda t: t.to(*args, **kwargs))
+        return self.map(lambda tensor: tensor.to(*args, **kwargs))
 
-    def _map(self, change) -> Self:
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """Apply `change` to every tensor."""
         levels = {k: (change(patch), change(special)) for k, (patch, special) in self.levels.items()}
         return replace(self, levels=levels, extra={k: change(value) for k, value in self.extra.items()})
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Return everything as named tensors, for a cache or a file."""
-        named = {f"{layer}.patch": patch for layer, (patch, _) in self.levels.items()}
-        named |= {f"{layer}.special": special for layer, (_, special) in self.levels.items()}
-        return {**named, **_meta_tensors(self), **_extra_tensors(self)}
-
-    @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
-        """Rebuild what `tensors` returned."""
-        layers = sorted(int(k.removesuffix(".patch")) for k in tensors if k.endswith(".patch"))
-        levels = {i: (tensors[f"{i}.patch"], tensors[f"{i}.special"]) for i in layers}
-        return cls(levels=levels, extra=_read_extra(tensors), **_read_meta(tensors))
 
 
 def _views(tensor: Tensor, views: Sequence[int]) -> Tensor:
     """Return chosen views of a tensor (B, S, ...); without positions on the device, for which an accelerator waits."""
     return torch.stack([tensor[:, view] for view in views], dim=1)
-
-
-def _meta_tensors(value: ViewTokens | Features) -> dict[str, Tensor]:
-    return {name: torch.tensor(getattr(value, name)) for name in _META_KEYS}
-
-
-def _extra_tensors(value: ViewTokens | Features) -> dict[str, Tensor]:
-    return {f"extra.{name}": tensor for name, tensor in value.extra.items()}
-
-
-def _read_extra(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {name.removeprefix("extra."): value for name, value in tensors.items() if name.startswith("extra.")}
-
-
-def _read_meta(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, int]]:
-    return {name: (int(tensors[name][0]), int(tensors[name][1])) for name in _META_KEYS}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -9,12 +9,11 @@ from freegeo.adaptation.losses import (
     adaptation_loss,
     choose_form,
     draw_tokens,
-    not_finite,
     teacher_spread,
 )
 from freegeo.adaptation.losses.sampling import anchor_tokens, search_anchors
 from freegeo.adaptation.recipe import PAPER, RELEASED_DA3, RELEASED_VGGT
-from freegeo.errors import FreeGeoError, UserError
+from freegeo.errors import UserError
 from loss_tools import teacher_side
 
 KEPT = [0, 2, 4, 6]
@@ -42,7 +41,7 @@ def features(seed=0, dtype=torch.float32, special=3):
 def draws_for(config, seed=1, special=3):
     tokens = 20 + (special if config.cross_tokens == "all" else 0)
     generator = torch.Generator().manual_seed(seed)
-    return draw_tokens(config, tokens_per_view=tokens, student_views=4, held_out_views=4, generator=generator)
+    return draw_tokens(config, tokens_per_view=tokens, student_views=4, held_out=4 * tokens, generator=generator)
 
 
 def loss_and_gradient(student, teacher, config, scale=1.0, **settings):
@@ -193,16 +192,8 @@ def test_anchors_are_those_of_the_draw():
         assert all(torch.equal(found[b], held_out[b][wanted[b]]) for b in range(2))
 
 
-def test_the_first_term_that_is_not_finite_is_named():
-    terms = {"intra": torch.tensor(1.0), "kl_pq": torch.tensor(torch.nan), "total": torch.tensor(torch.inf)}
-    assert not_finite(terms) == "kl_pq"
-    assert not_finite({"intra": torch.tensor(1.0)}) is None
-
-
 def test_what_cannot_work_is_refused():
-    student, teacher = features()
     config = CONFIGS["paper"]
-    draws = draws_for(config)
     with pytest.raises(UserError, match="temperature must be positive"):
         replace(config, temperature=0.0)
     with pytest.raises(UserError, match="needs pairing 'paired'"):
@@ -214,20 +205,14 @@ def test_what_cannot_work_is_refused():
     for weights in ({"weight_kq": -1.0}, {"weight_huber": float("nan")}, {"angle_weights": (1.0, -1.0, 1.0)}):
         with pytest.raises(UserError, match="weights must be 0 or more"):
             replace(config, **weights)
-    with pytest.raises(UserError, match="at least 3 views"):
-        draw_tokens(config, tokens_per_view=4, student_views=2, held_out_views=0, generator=torch.Generator())
     with pytest.raises(UserError, match="reference_view is 9"):
         draw_tokens(
             replace(config, reference_view=9),
             tokens_per_view=4,
             student_views=2,
-            held_out_views=1,
+            held_out=4,
             generator=torch.Generator(),
         )
-    with pytest.raises(UserError, match="keeps every view"):
-        teacher_side(teacher, list(range(8)), config)
-    with pytest.raises(FreeGeoError, match="same layers"):
-        adaptation_loss({5: student[5]}, *teacher_side(teacher, KEPT, config), draws, config)
     with pytest.raises(FrozenInstanceError):
         config.temperature = 2.0
 

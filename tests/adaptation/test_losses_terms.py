@@ -292,7 +292,7 @@ def test_paper_loss_equals_the_equations(settings, repeated):
     student = teacher[:, kept] + torch.randn(2, 4, 15, 16, generator=generator, dtype=FLOAT64)
     student.requires_grad_()
     config = PAPER.changed(loss={"temperature": 2.0, "num_reference": 6, "num_query": 9, **settings}).loss
-    draws = draw_tokens(config, tokens_per_view=12, student_views=4, held_out_views=4, generator=generator)
+    draws = draw_tokens(config, tokens_per_view=12, student_views=4, held_out=48, generator=generator)
     levels = [{5: (tokens[:, :, 3:], tokens[:, :, :3])} for tokens in (student, teacher)]
     found, terms = adaptation_loss(levels[0], *teacher_side(levels[1], kept, config), draws, config)
 
@@ -324,7 +324,7 @@ def test_outlier_channels_at_temperature_one_keep_every_version_finite():
     student = teacher[:, ::2] + 5 * torch.randn(1, 4, 20, 32, generator=generator)
     for config in (replace(PAPER.loss, temperature=1.0), RELEASED_VGGT.loss):
         tokens = 25 if config.cross_tokens == "all" else 20
-        draws = draw_tokens(config, tokens_per_view=tokens, student_views=4, held_out_views=4, generator=generator)
+        draws = draw_tokens(config, tokens_per_view=tokens, student_views=4, held_out=4 * tokens, generator=generator)
         inputs = (student.clone().requires_grad_(), special[:, ::2].clone().requires_grad_())
         side = teacher_side({0: (teacher, special)}, [0, 2, 4, 6], config)
         loss, terms = adaptation_loss({0: inputs}, *side, draws, config)

@@ -1,58 +1,29 @@
 """The memory planner: published measurements, tensors that really live, and what it chooses."""
 
-import weakref
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from freegeo.adaptation import memory
-from freegeo.adaptation.adapt import adapt, visited
+from freegeo.adaptation.adapt import adapt
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.memory import Footprint, plan_adaptation, plan_reconstruction, shape_of
-from freegeo.adaptation.recipe import named, paper, scene
+from freegeo.adaptation.memory import Footprint, plan_adaptation
+from freegeo.adaptation.recipe import named, scene
 from freegeo.adaptation.samples import Samples, SceneImages
-from freegeo.adaptation.views import schedule
+from freegeo.adaptation.views import schedule, visited
 from freegeo.errors import UserError
-from freegeo.models.api import embed_in_chunks
 from freegeo.models.catalog import build_empty
 from freegeo.models.da3 import DA3
 from freegeo.models.da3_config import DA3Config
+from freegeo.models.memory import shape_of
 from freegeo.models.precision import Compute
-from tiny_models import DEFAULTS, randomise, tiny_da3, tiny_mapanything, tiny_pi3, tiny_pi3x, tiny_vggt
+from live_bytes import LiveBytes
+from tiny_models import DEFAULTS, parts_of, randomise, tiny_da3, tiny_vggt
 
 CPU, CUDA, MPS = Compute(), torch.device("cuda"), torch.device("mps")
 GB = 1_000_000_000
-
-
-class LiveBytes(TorchDispatchMode):
-    """Counts the bytes of all tensors made while it is on, from their making to their end."""
-
-    def __init__(self, model):
-        super().__init__()
-        # Weights are there before; views of them are made all the time.
-        self.sizes = {p.untyped_storage()._cdata: 0 for p in model.parameters()}
-        self.live = self.peak = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        found = func(*args, **(kwargs or {}))
-        for tensor in found if isinstance(found, tuple | list) else (found,):
-            if isinstance(tensor, torch.Tensor):
-                self._count(tensor.untyped_storage())
-        return found
-
-    def _count(self, storage) -> None:
-        key = storage._cdata
-        if key not in self.sizes:
-            self.sizes[key] = storage.nbytes()
-            self.live += storage.nbytes()
-            self.peak = max(self.peak, self.live)
-            weakref.finalize(storage, self._end, key)
-
-    def _end(self, key: int) -> None:
-        self.live -= self.sizes.pop(key)
 
 
 def wide_da3(ffn: str = "mlp") -> DA3:
@@ -157,7 +128,7 @@ def test_samples_are_counted_to_the_byte(build, hold):
     sample = samples.take(steps[0][0])
     samples.close()
     extra = sum(value.nbytes for value in sample.tokens.extra.values())
-    sizes = sum(value.nbytes for name, value in sample.tensors().items() if not name.endswith("_hw")) - extra
+    sizes = sum(tensor.nbytes for tensor in parts_of(sample)) - extra
     twice = recipe.changed(epochs=2)
     plan = plan_adaptation(model, [images(12, 32)], twice, schedule([12], twice, 42), compute=CPU)
     # VGGT adds its special tokens after embedding; they are counted all the same.
@@ -168,7 +139,7 @@ def test_samples_are_counted_to_the_byte(build, hold):
 def eth3d(budget_gb: float, name: str = "da3-giant", **changes):
     """The ETH3D-sized job: 11 scenes, 5 view sets each, 3 epochs, batch 4."""
     model = build_empty(name)
-    recipe = paper(model.spec, "eth3d").changed(sets_per_scene=5, **changes)
+    recipe = named("paper", model.spec, "eth3d").changed(sets_per_scene=5, **changes)
     scenes = [
         SceneImages(name=str(n), count=40, load=lambda f: torch.empty(len(f), 3, 518, 518, device="meta"))
         for n in range(11)
@@ -228,32 +199,6 @@ def test_every_run_plans_with_what_is_free(monkeypatch):
         adapt(model, [images(9, 32)], scene(model.spec), seed=0)
 
 
-def test_a_model_that_is_in_memory_already_is_not_counted_twice(monkeypatch):
-    monkeypatch.setattr(memory, "host_available", lambda: 1_000_000)
-    model = tiny_da3()
-    assert memory.available(CPU.device, model) == 800_000 + sum(p.nbytes for p in model.parameters())
-    assert memory.available(MPS, model) == 800_000
-
-
-def test_reconstruction_says_how_many_views_fit():
-    model, compute = build_empty("da3-giant"), Compute(device=CUDA, precision="bf16")
-    _, fitting = plan_reconstruction(model, 8, (504, 378), compute=compute, budget=16 * GB)
-    parts, _ = plan_reconstruction(model, fitting, (504, 378), compute=compute, budget=16 * GB)
-    assert sum(size for _, size in parts) <= 16 * GB
-    with pytest.raises(UserError, match=f"at most {fitting} views .--max-views {fitting}. or smaller images"):
-        plan_reconstruction(model, fitting + 1, (504, 378), compute=compute, budget=16 * GB)
-    with pytest.raises(UserError, match="smaller model"):
-        plan_reconstruction(model, 4, (504, 378), compute=compute, budget=2 * GB)
-
-
-@pytest.mark.parametrize("build", [tiny_da3, tiny_vggt, tiny_pi3x, tiny_mapanything])
-def test_an_adapter_that_is_on_does_not_change_a_model_s_shape(build):
-    model = build()
-    before = shape_of(model)
-    Adapter.attach(model, rank=2, alpha=2, dropout=0.0, generator=torch.Generator())
-    assert shape_of(model) == before
-
-
 MEASURED_GB = [
     # model, recipe, images, place, checkpointing, hold, measured peak (benchmarks/results/gpu-steps.json)
     ("da3-giant", "released-da3", (518, 518), "device", False, 0.0, 24.01),
@@ -277,31 +222,3 @@ def test_the_peak_agrees_with_what_a_gpu_measured(name, recipe, image_hw, place,
     compute = Compute(device=CUDA, precision="bf16")
     job = Footprint(model, scenes, recipe, visited(schedule([8] * 4, recipe, 42)), compute)
     assert job.plan(place, checkpointing).peak_bytes / GB == pytest.approx(peak, rel=0.13)
-
-
-RECONSTRUCTION_GB = {
-    ("da3-giant", 8): 8.42, ("da3-giant", 32): 10.89, ("da3-giant", 100): 20.13,
-    ("vggt-1b", 8): 7.32, ("vggt-1b", 32): 8.22, ("vggt-1b", 100): 12.31,
-    ("da3-base", 8): 2.41, ("da3-base", 32): 3.66, ("da3-base", 100): 8.07,
-}  # fmt: skip
-"""Peaks of 504 x 378 pixels in bf16 (benchmarks/results/gpu-reconstruct.json)."""
-
-
-@pytest.mark.parametrize(("name", "views"), RECONSTRUCTION_GB)
-def test_reconstruction_s_peak_agrees_with_what_a_gpu_measured(name, views):
-    compute = Compute(device=CUDA, precision="bf16")
-    parts, _ = plan_reconstruction(build_empty(name), views, (378, 504), compute=compute, budget=80 * GB)
-    assert sum(size for _, size in parts) / GB == pytest.approx(RECONSTRUCTION_GB[name, views], rel=0.15)
-
-
-@pytest.mark.parametrize("build", [tiny_da3, tiny_vggt, tiny_pi3, tiny_pi3x, tiny_mapanything])
-@pytest.mark.parametrize("views", [4, 24])
-def test_reconstruction_s_peak_covers_the_tensors_alive(build, views):
-    model = build()
-    pixels = torch.rand(views, 3, 64, 64)
-    parts, _ = plan_reconstruction(model, views, (64, 64), compute=CPU, budget=GB)
-    with torch.no_grad(), LiveBytes(model) as live:
-        tokens = embed_in_chunks(model, pixels, device=CPU.device)
-        model.decode(model.aggregate(tokens))
-    alive = live.peak + pixels.nbytes + sum(p.nbytes for p in model.parameters())
-    assert sum(size for _, size in parts) == pytest.approx(alive, rel=0.35)

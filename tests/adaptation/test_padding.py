@@ -7,7 +7,7 @@ import torch
 
 from freegeo.adaptation.adapt import adapt
 from freegeo.adaptation.losses import adaptation_loss, draw_tokens, held_out_tokens
-from freegeo.adaptation.recipe import PAPER, RELEASED_DA3, RELEASED_VGGT, released
+from freegeo.adaptation.recipe import PAPER, RELEASED_DA3, RELEASED_VGGT, named
 from freegeo.adaptation.samples import Samples, SceneImages, released_augmentation, step_draws
 from freegeo.adaptation.views import schedule
 from freegeo.errors import UserError
@@ -43,8 +43,8 @@ def loss_of(student, teacher, config, patches):
     held_out = held_out_tokens(teacher[3], KEPT, config, patches=patches)
     kept = None if patches is None else patches[KEPT]
     draws = draw_tokens(
-        config, tokens_per_view=teacher[3][0].shape[2] + special, student_views=4, held_out_views=4,
-        generator=torch.Generator().manual_seed(1), patches=kept, held_out_count=held_out.shape[1],
+        config, tokens_per_view=teacher[3][0].shape[2] + special, student_views=4, held_out=held_out.shape[1],
+        generator=torch.Generator().manual_seed(1), patches=kept,
     )  # fmt: skip
     student = {n: tuple(part.clone().requires_grad_() for part in level) for n, level in student.items()}
     kept_levels = {n: tuple(part[:, KEPT] for part in level) for n, level in teacher.items()}
@@ -101,7 +101,7 @@ def test_views_without_a_patch_in_common_are_refused():
     patches[:2, :12] = patches[2:, 12:] = True
     with pytest.raises(UserError, match="no patch in common"):
         draw_tokens(
-            RELEASED_DA3.loss, tokens_per_view=PATCHES, student_views=4, held_out_views=4,
+            RELEASED_DA3.loss, tokens_per_view=PATCHES, student_views=4, held_out=4 * PATCHES,
             generator=torch.Generator(), patches=patches,
         )  # fmt: skip
 
@@ -131,26 +131,29 @@ def test_samples_know_which_patches_show_a_photo(place, hold, tmp_path):
     for visits in steps:
         for visit in visits:
             sample, frames = samples.take(visit), visit.view_set.frames
-            read = visit.view_set.positions if hold else visit.view_set.kept
+            read = range(len(frames)) if hold else visit.view_set.kept
             expected = torch.stack([middle if frames[p] in (1, 2, 6) else torch.ones_like(middle) for p in read])
             assert torch.equal(sample.patches, expected)
             held_out = [frame for p, frame in enumerate(frames) if p not in visit.view_set.kept]
             assert sample.held_out.shape[1] == sum(4 if frame in (1, 2, 6) else 16 for frame in held_out)
-            draws = step_draws(sample, visit, recipe.loss, seed=42).angle
-            assert sample.student_patches()[0][draws.reference].all()
-            assert sample.student_patches()[1:].flatten()[draws.query].all()
+            student = sample.student()
+            draws = step_draws(student, visit.step, recipe.loss, seed=42).angle
+            assert student.patches[0][draws.reference].all()
+            assert student.patches[1:].flatten()[draws.query].all()
     samples.close()
 
 
 def test_the_mask_is_mirrored_with_the_images():
     model, scene = tiny_vggt(), padded_scene()
-    recipe = released("released-vggt", "eth3d").changed(epochs=1, sets_per_scene=6, distinct_seeds=6, rank=2, batch=1)
+    recipe = named("released-vggt", model.spec, "eth3d").changed(
+        epochs=1, sets_per_scene=6, distinct_seeds=6, rank=2, batch=1
+    )
     steps = schedule([scene.count], recipe, seed=0)
     samples = Samples(attach(model), [scene], recipe, steps, compute=Compute(), place="device", folder=None, seed=0)
     mirrored = []
     for [visit] in steps:
         frames, kept = visit.view_set.frames, list(visit.view_set.kept)
-        found = samples.take(visit).student_patches()
+        found = samples.take(visit).student().patches
         pixels = released_augmentation(scene.inside[list(frames)][:, None].float(), visit.view_set.seed)[kept, 0]
         shown = torch.nn.functional.avg_pool2d((pixels > 0).float()[:, None], PATCH).flatten(1) >= 0.5
         if shown.all():

@@ -63,7 +63,7 @@ def test_released_runs_have_the_published_number_of_steps(name, dataset, scenes)
 
 
 def test_the_papers_settings_are_those_of_a_published_model():
-    assert recipes.paper(GIANT, "eth3d") == recipes.PAPER
+    assert recipes.named("paper", GIANT, "eth3d") == recipes.PAPER
     loss = recipes.PAPER.loss
     assert (loss.num_reference, loss.num_query, loss.num_anchors) == (256, 256, 4)
     assert (recipes.PAPER.views, recipes.PAPER.rank, recipes.PAPER.alpha) == (8, 32, 32)
@@ -137,7 +137,7 @@ def test_changed_replaces_what_is_given_and_leaves_the_rest():
     scene = recipes.scene(SPEC)
     assert scene.changed(lr=None, rank=None) == scene
     assert scene.changed(epochs=2).steps is None
-    assert recipes.paper(GIANT, "eth3d").changed(steps=7).epochs is None
+    assert recipes.named("paper", GIANT, "eth3d").changed(steps=7).epochs is None
     wider = scene.changed(rank=16)
     assert (wider.rank, wider.alpha) == (16, 16)
     assert scene.changed(rank=16, alpha=8).alpha == 8

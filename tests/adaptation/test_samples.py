@@ -10,7 +10,7 @@ import torch
 from freegeo.adaptation import samples as sampling
 from freegeo.adaptation.adapt import adapt
 from freegeo.adaptation.adapter import Adapter, is_adapted
-from freegeo.adaptation.recipe import released
+from freegeo.adaptation.recipe import named
 from freegeo.adaptation.samples import Samples, SceneImages, loaded_ahead
 from freegeo.adaptation.views import schedule
 from freegeo.errors import FreeGeoError, UserError
@@ -48,11 +48,11 @@ def test_a_sample_is_the_frozen_model_s_view_of_its_set(build, hold, place, tmp_
             sample, kept = samples.take(visit), list(visit.view_set.kept)
             tokens = embed_in_chunks(model, scene.load(visit.view_set.frames), device=CPU)
             levels = model.aggregate(tokens, layers=model.spec.loss_layers).levels
-            found, teacher = sample.student()
-            assert torch.equal(found.tokens, tokens.tokens[:, kept])
+            student = sample.student()
+            assert torch.equal(student.tokens.tokens, tokens.tokens[:, kept])
             for layer, (patch, special) in levels.items():
-                assert torch.equal(teacher[layer][0], patch[:, kept])
-                assert torch.equal(teacher[layer][1], special[:, kept])
+                assert torch.equal(student.teacher.levels[layer][0], patch[:, kept])
+                assert torch.equal(student.teacher.levels[layer][1], special[:, kept])
             assert torch.equal(sample.held_out, levels[max(levels)][0][:, 1::2].flatten(1, 2))
             assert sample.tokens.tokens.shape[1] == (8 if hold else 4)
     samples.close()
@@ -93,7 +93,7 @@ def test_a_sample_is_kept_from_its_first_visit_to_its_last():
         samples.close()
         return alive
 
-    redrawn = released("released-vggt", "eth3d").changed(epochs=4, sets_per_scene=2, rank=2, batch=1)
+    redrawn = named("released-vggt", tiny_vggt().spec, "eth3d").changed(epochs=4, sets_per_scene=2, rank=2, batch=1)
     assert alive_after_each_visit(tiny_vggt(), redrawn) == [0] * 8
     assert alive_after_each_visit(tiny_da3(), quick(tiny_da3(), epochs=3, sets_per_scene=2, distinct_seeds=2)) == [
         1, 2, 2, 2, 1, 0,
@@ -128,7 +128,7 @@ def test_images_are_loaded_and_embedded_once_in_the_background(place, tmp_path):
 
 def test_augmented_images_are_embedded_for_every_set():
     calls, model = [], tiny_vggt()
-    recipe = released("released-vggt", "eth3d").changed(epochs=2, sets_per_scene=2, rank=2, batch=1)
+    recipe = named("released-vggt", tiny_vggt().spec, "eth3d").changed(epochs=2, sets_per_scene=2, rank=2, batch=1)
     samples, visits = opened(model, [recorded_scene(calls)], recipe)
     for visit in visits:
         samples.take(visit)

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from freegeo import __version__
-from freegeo.adaptation.needs import model_needs
 from freegeo.cli import app, console
 from freegeo.cli.app import COMMANDS, main
+from freegeo.cli.models import needs_of
 from freegeo.models import catalog
 
 
@@ -351,7 +351,7 @@ def test_models_and_describe_show_one_size_one_download_and_the_planned_memory(f
     monkeypatch.setattr(catalog, "names", lambda: ["da3-base", "vggt-1b", "freegeo-tiny"])
     said = freegeo("models").out
     lines = {line.split()[0]: line for line in said.splitlines() if line.strip()}  # of the last table with the name
-    needs = {item.entry.name: item for item in model_needs()}
+    needs = {item.entry.name: item for item in catalog.for_each(needs_of)}
     assert list(needs) == catalog.names()
     assert "included" in lines["freegeo-tiny"]
     for name in ("da3-base", "vggt-1b"):

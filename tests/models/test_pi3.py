@@ -16,7 +16,6 @@ sys.path.append(str(TESTS))  # the parity modules are shared with the full parit
 from fixture_tools import relative_error  # noqa: E402
 from freegeo.adaptation.adapt import adapt  # noqa: E402
 from freegeo.adaptation.adapter import count_trainable  # noqa: E402
-from freegeo.adaptation.memory import shape_of  # noqa: E402
 from freegeo.data.photos import load_photos  # noqa: E402
 from freegeo.errors import UserError  # noqa: E402
 from freegeo.geometry.local_points import K_from_local_points  # noqa: E402
@@ -24,6 +23,7 @@ from freegeo.geometry.rotation import closest_rotation  # noqa: E402
 from freegeo.geometry.se3 import from_Rt  # noqa: E402
 from freegeo.models.catalog import build_empty  # noqa: E402
 from freegeo.models.images import read_some  # noqa: E402
+from freegeo.models.memory import shape_of  # noqa: E402
 from freegeo.models.pi3_priors import given_of, pose_tables, turn  # noqa: E402
 from freegeo.models.precision import Compute  # noqa: E402
 from freegeo.types import Priors, ViewTokens  # noqa: E402

@@ -15,7 +15,7 @@ import freegeo
 from freegeo.adaptation.adapt import adapt
 from freegeo.adaptation.adapter import count_trainable
 from freegeo.adaptation.adapter_files import export_published, load_adapter, save_adapter
-from freegeo.adaptation.recipe import released
+from freegeo.adaptation.recipe import named
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.models import catalog
 from freegeo.models.api import ReconstructionModel
@@ -131,7 +131,7 @@ def test_the_engine_adapts_it_without_a_camera_token():
 
 def test_the_recipe_that_wants_every_special_token_takes_none():
     model = load()
-    recipe = released("released-vggt", "eth3d").changed(steps=1, sets_per_scene=1)
+    recipe = named("released-vggt", model.spec, "eth3d").changed(steps=1, sets_per_scene=1)
     assert adapt(model, [noise_scene(4)], recipe, seed=42).curve[0]["total"] > 0
 
 

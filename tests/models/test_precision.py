@@ -156,7 +156,7 @@ def test_half_precision_stays_in_the_products_of_embed_and_aggregate(make, preci
     with Recorder() as losing:
         loss, _ = adaptation_loss(
             student.levels, teacher.select(kept).levels, held_out_tokens(teacher.levels[last], kept, config),
-            draw_tokens(config, tokens_per_view=16, student_views=2, held_out_views=2, generator=torch.Generator()),
+            draw_tokens(config, tokens_per_view=16, student_views=2, held_out=32, generator=torch.Generator()),
             config,
         )  # fmt: skip
     assert losing.everything() == {torch.float32, torch.float64}
@@ -169,7 +169,7 @@ def test_losses_of_half_features_are_computed_in_float32():
     generator = torch.Generator().manual_seed(0)
     patch, other = (torch.randn(1, 2, 16, 32, generator=generator).bfloat16() for _ in range(2))
     special = patch[:, :, :1]
-    draws = draw_tokens(config, tokens_per_view=16, student_views=2, held_out_views=2, generator=generator)
+    draws = draw_tokens(config, tokens_per_view=16, student_views=2, held_out=32, generator=generator)
     with Recorder() as losing:
         loss, terms = adaptation_loss(
             {0: (patch.requires_grad_(), special)}, {0: (other, special)}, other.flatten(1, 2), draws, config

@@ -10,11 +10,10 @@ import pytest
 import torch
 
 import freegeo
-from freegeo.adaptation import memory
 from freegeo.data.photos import MemoryPhoto
 from freegeo.errors import UserError
 from freegeo.files import read_json
-from freegeo.models import catalog, da3, da3_images, vggt_images
+from freegeo.models import catalog, da3, da3_images, memory, vggt_images
 from freegeo.models.da3_config import EMBEDDED, SMALL
 from freegeo.models.images import SIDE_FACTOR, chosen_side, look_at_photos, read_photos
 from freegeo.models.precision import Compute

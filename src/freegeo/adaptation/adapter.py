@@ -83,7 +83,8 @@ class Adapter:
         self.process_res = model.adapted_at = process_res
         self.lora_config = lora_config
         self.layers = layers
-        self._base_token = _parameter(model, model.camera_token_name)
+        token = model.camera_token_name
+        self._base_token = None if token is None else model.get_parameter(token)
         self.camera_token = None if self._base_token is None else nn.Parameter(self._base_token.detach().clone())
         self._scaling = {name: layer.scaling[ADAPTER_NAME] for name, layer in layers.items()}
         self.strength = 1.0
@@ -328,7 +329,3 @@ def _draw_start(layer: LoraLayer, generator: torch.Generator) -> None:
     bound = 1 / math.sqrt(a.shape[1])
     a.copy_(torch.rand(a.shape, generator=generator) * 2 * bound - bound)
     b.zero_()
-
-
-def _parameter(model: nn.Module, name: str | None) -> nn.Parameter | None:
-    return None if name is None else model.get_parameter(name)

@@ -173,12 +173,13 @@ def _camera_token(model: ReconstructionModel, folder: Path) -> dict[str, Tensor]
         tensors = read_tensors(path)
         require_sound(tensors, path)
         return tensors
-    if (folder / METADATA).is_file() and model.camera_token_name is not None:
+    if model.camera_token_name is None:
+        return {}
+    if (folder / METADATA).is_file():
         raise UserError(f"{path}: this file of the adapter is missing. Copy the whole folder that freegeo wrote.")
     # A plain peft adapter has no camera token; the authors' always has one.
-    if is_published(folder) and model.camera_token_name is not None:
-        return {"camera_token": read_camera_token(folder)}
-    return {}
+    folder = folder.absolute()
+    return {"camera_token": read_camera_token(folder)} if folder.name.endswith(LORA_SUFFIX) else {}
 
 
 def _base(model: ReconstructionModel) -> dict[str, Any]:
@@ -280,17 +281,11 @@ def own_names(model: ReconstructionModel, tensors: Mapping[str, Tensor]) -> dict
     return {f"{root}.{name}": value for name, value in tensors.items()}
 
 
-def is_published(folder: Path) -> bool:
-    """Whether a folder is, by its name, the peft folder of a published adapter."""
-    return folder.absolute().name.endswith(LORA_SUFFIX)
-
-
 def read_camera_token(folder: Path) -> Tensor:
     """Read the camera token that belongs to a published peft folder; nothing in the file is executed.
 
     UserError when the file is missing or holds something else.
     """
-    folder = folder.absolute()
     path = folder.with_name(folder.name.removesuffix(LORA_SUFFIX) + TOKEN_SUFFIX)
     if not path.is_file():
         raise UserError(f"{path}: the camera token of {folder.name} is missing. Copy that file beside the folder.")

@@ -198,7 +198,7 @@ class Recipe:
                 raise UserError(f"recipe setting {name} must be 0 or more and finite, got {getattr(self, name)}.")
         if not (self.features or self.cameras):
             raise UserError("a recipe needs a weight of features or of cameras above 0.")
-        if self.cameras and (self.squash is not None or self.augmentation != "none"):
+        if self.cameras and self.changes_images:
             raise UserError("recipe setting cameras needs images as the model makes them: no squash, no augmentation.")
         for name in ("lr", "rank", "alpha", "batch", "sets_per_scene", "distinct_seeds", "clip"):
             if not 0 < getattr(self, name) < math.inf:
@@ -218,6 +218,11 @@ class Recipe:
     def sees_all(self) -> bool:
         """Whether a term compares what the adapted model says with all N views."""
         return bool(self.hold or self.cameras)
+
+    @property
+    def changes_images(self) -> bool:
+        """Whether images are mirrored or squashed, which known cameras do not follow."""
+        return self.squash is not None or self.augmentation != "none"
 
     def _check_keep(self, keep: tuple[int, ...]) -> None:
         listed = ",".join(map(str, keep))
@@ -284,6 +289,15 @@ def require_guard(guard: object) -> None:
     """Raise UserError for something that is no `Guard`."""
     if guard not in get_args(Guard):
         raise UserError(f"guard is {', '.join(get_args(Guard))}, not {guard!r}.")
+
+
+def require_unchanged_images(recipe: Recipe) -> None:
+    """Raise UserError for a recipe that cannot be used with known cameras."""
+    if recipe.changes_images:
+        raise UserError(
+            f"recipe '{recipe.name}' mirrors or squashes the images, and known cameras are of the photos as they are. "
+            "Choose another --recipe, such as scene, or leave the cameras out."
+        )
 
 
 class DatasetRow(NamedTuple):
@@ -389,32 +403,6 @@ RELEASED_VGGT = _RELEASED.changed(
 """What the authors' VGGT runner computes: every token, Huber angles."""
 
 
-def named(name: str, spec: ModelSpec, dataset: str | None = None) -> Recipe:
-    """Return a recipe by name, for a model and, where the settings depend on it, a dataset.
-
-    UserError for an unknown recipe or dataset, a dataset recipe without a dataset, or `scene` with one.
-    """
-    if name in OWN:
-        if dataset is not None:
-            raise UserError(
-                f"recipe '{name}' has no settings per dataset, so --dataset {dataset} would change nothing. Leave it "
-                "out, or choose --recipe paper, released-da3 or released-vggt."
-            )
-        return OWN[name](spec)
-    if name == "paper":
-        return paper(spec, dataset)
-    families = {RELEASED_DA3.name: "da3", RELEASED_VGGT.name: "vggt"}
-    if name in families:
-        if spec.adaptation.published not in (None, families[name]):
-            logger.warning(
-                "recipe '%s' holds the settings of another model family than that of %s; its own are 'released-%s'",
-                name, spec.name, spec.adaptation.published,
-            )  # fmt: skip
-        return released(name, dataset, spec)
-    *others, last = get_args(RecipeName)
-    raise UserError(f"unknown recipe '{name}'. Known are {', '.join(others)} and {last}.")
-
-
 def scene(spec: ModelSpec) -> Recipe:
     """Return the recipe for one source: the paper's losses and `hold`, the model's rate, 100 steps of batch 1."""
     own = spec.adaptation
@@ -435,28 +423,48 @@ OWN: Mapping[str, Callable[[ModelSpec], Recipe]] = {"scene": scene, "evidence": 
 """Our recipes for the photos of one place, which have no settings per dataset."""
 
 
-def paper(spec: ModelSpec, dataset: str | None) -> Recipe:
-    """Return the paper's settings of a dataset; a model without published settings keeps its own rank."""
+PUBLISHED: Mapping[str, tuple[Recipe, Mapping[str, DatasetRow], str | None]] = {
+    PAPER.name: (PAPER, PAPER_DATASETS, None),
+    RELEASED_DA3.name: (RELEASED_DA3, RELEASED_DA3_DATASETS, "da3"),
+    RELEASED_VGGT.name: (RELEASED_VGGT, RELEASED_VGGT_DATASETS, "vggt"),
+}
+"""Recipes with settings per dataset, and the model family that they are for; None: any."""
+
+
+def named(name: str, spec: ModelSpec, dataset: str | None = None) -> Recipe:
+    """Return a recipe by name, for a model and, where the settings depend on it, a dataset.
+
+    `paper` takes the model's temperature, and the rank of one without published settings.
+
+    UserError for an unknown recipe or dataset, a dataset recipe without a dataset, or `scene` with one.
+    """
     own = spec.adaptation
-    row = _row(PAPER_DATASETS, dataset, PAPER.name, spec)
-    return PAPER.changed(
-        **row._asdict(), rank=None if own.published else own.rank, neighbours=own.neighbours,
-        loss={"temperature": own.temperature},
-    )  # fmt: skip
-
-
-def released(name: str, dataset: str | None, spec: ModelSpec | None = None) -> Recipe:
-    """Return what the authors' runner of a model family computes, per dataset."""
-    is_da3 = name == RELEASED_DA3.name
-    recipe, rows = (RELEASED_DA3, RELEASED_DA3_DATASETS) if is_da3 else (RELEASED_VGGT, RELEASED_VGGT_DATASETS)
-    return recipe.changed(**_row(rows, dataset, name, spec)._asdict())
-
-
-def _row(rows: Mapping[str, DatasetRow], dataset: str | None, name: str, spec: ModelSpec | None) -> DatasetRow:
-    if dataset == "procedural" and spec is not None:
-        # Generated rooms are no published dataset; 150 steps of batch 4 over 10 to 100 rooms was measured to suffice.
-        return DatasetRow(4, 4, 3, spec.adaptation.scene_lr, 1e-6)
-    if dataset is None or dataset not in rows:
-        known = ", ".join(rows)
-        raise UserError(f"recipe '{name}' has settings per dataset: choose --dataset from {known}, or --recipe scene.")
-    return rows[dataset]
+    if name in OWN:
+        if dataset is not None:
+            raise UserError(
+                f"recipe '{name}' has no settings per dataset, so --dataset {dataset} would change nothing. Leave it "
+                "out, or choose --recipe paper, released-da3 or released-vggt."
+            )
+        return OWN[name](spec)
+    if name not in PUBLISHED:
+        *others, last = get_args(RecipeName)
+        raise UserError(f"unknown recipe '{name}'. Known are {', '.join(others)} and {last}.")
+    recipe, rows, family = PUBLISHED[name]
+    if family is not None and own.published not in (None, family):
+        logger.warning(
+            "recipe '%s' holds the settings of another model family than that of %s; its own are 'released-%s'",
+            name, spec.name, own.published,
+        )  # fmt: skip
+    # Generated rooms are no published dataset; 150 steps of batch 4 over 10 to 100 rooms was measured to suffice.
+    rows = {**rows, "procedural": DatasetRow(4, 4, 3, own.scene_lr, 1e-6)}
+    if dataset not in rows:
+        *known, _ = rows
+        raise UserError(
+            f"recipe '{name}' has settings per dataset: choose --dataset from {', '.join(known)}, or --recipe scene."
+        )
+    recipe = recipe.changed(**rows[dataset]._asdict())
+    if family is not None:
+        return recipe
+    return recipe.changed(
+        rank=None if own.published else own.rank, neighbours=own.neighbours, loss={"temperature": own.temperature}
+    )

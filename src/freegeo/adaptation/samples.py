@@ -11,7 +11,7 @@ import random
 import shutil
 import tempfile
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -26,7 +26,6 @@ from freegeo.adaptation.adapter import Adapter
 from freegeo.adaptation.losses import (
     CameraTargets,
     KLForm,
-    Level,
     StepDraws,
     choose_form,
     draw_tokens,
@@ -78,11 +77,6 @@ class SceneImages:
     images (`views.chunk_windows`)."""
     process_res: int | None = None
     """Longest side of the images that was asked for; None: the model's default, or a square of the recipe."""
-
-    def __post_init__(self):
-        for window in self.windows or ():
-            if list(window) != sorted(set(window)) or not 0 <= window[0] <= window[-1] < self.count:
-                raise ValueError(f"a window of ascending numbers below {self.count} is needed, not {window}")
 
     @classmethod
     def from_batch(cls, name: str, batch: ImageBatch) -> SceneImages:
@@ -161,7 +155,7 @@ class Sample:
     """Everything a visit reads of its view set; tensors have a batch of 1 and no gradient."""
 
     tokens: ViewTokens
-    """The embedded views: the kept ones, or all N where the recipe has a term of all views."""
+    """The embedded views: the student's, or all N where the recipe has a term of all views."""
     teacher: Features
     """The teacher's features of the same views at the loss layers."""
     held_out: Tensor
@@ -177,49 +171,32 @@ class Sample:
     priors: Priors | None = None
     """What is known of the views of `tokens`; None: nothing. They stay on the CPU."""
 
-    def student(self) -> tuple[ViewTokens, Mapping[int, Level]]:
-        """Return tokens and teacher features of the student's views."""
-        if len(self.kept) == self.tokens.tokens.shape[1]:
-            return self.tokens, self.teacher.levels
-        return self.tokens.select(self.kept), self.teacher.select(self.kept).levels
+    def student(self) -> Sample:
+        """Return the sample of the student's views alone."""
+        return self if len(self.kept) == self.tokens.tokens.shape[1] else self.select(self.kept)
 
-    def student_patches(self) -> Tensor | None:
-        """Return the patches (M, P) of the student's views that take part in the losses; None: all."""
-        return None if self.patches is None else self.patches[list(self.kept)]
-
-    def student_targets(self) -> CameraTargets | None:
-        """Return the cameras of the student's views."""
-        return None if self.targets is None else self.targets.select(self.kept)
-
-    def student_priors(self) -> Priors | None:
-        """Return what is known of the student's views."""
-        return None if self.priors is None else self.priors.select(self.kept)
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors by name."""
-        named = {f"tokens|{name}": value for name, value in self.tokens.tensors().items()}
-        named |= {f"teacher|{name}": value for name, value in self.teacher.tensors().items()}
-        return {**named, "held_out|": self.held_out}
-
-    def with_tensors(self, tensors: Mapping[str, Tensor]) -> Sample:
-        """Return the sample with other tensors, by the names of `tensors`."""
-        parts: dict[str, dict[str, Tensor]] = {}
-        for name, value in tensors.items():
-            part, _, inner = name.partition("|")
-            parts.setdefault(part, {})[inner] = value
+    def select(self, views: Sequence[int]) -> Sample:
+        """Return the sample of some of its views, the student's among them."""
         return replace(
             self,
-            tokens=ViewTokens.from_tensors(parts["tokens"]),
-            teacher=Features.from_tensors(parts["teacher"]),
-            held_out=parts["held_out"][""],
+            tokens=self.tokens.select(views),
+            teacher=self.teacher.select(views),
+            kept=tuple(views.index(view) for view in self.kept),
+            patches=None if self.patches is None else self.patches[list(views)],
+            targets=None if self.targets is None else self.targets.select(views),
+            priors=None if self.priors is None else self.priors.select(views),
+        )
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Sample:
+        """Apply `change` to every tensor that is worth moving: tokens and features."""
+        return replace(
+            self, tokens=self.tokens.map(change), teacher=self.teacher.map(change), held_out=change(self.held_out)
         )
 
     def to(self, device: torch.device) -> Sample:
         """Return the sample on a device."""
-        return replace(
-            self, tokens=self.tokens.to(device), teacher=self.teacher.to(device), held_out=self.held_out.to(device),
-            targets=None if self.targets is None else self.targets.to(device),
-        )  # fmt: skip
+        targets = None if self.targets is None else self.targets.to(device)
+        return replace(self.map(lambda tensor: tensor.to(device)), targets=targets)
 
 
 class Samples:
@@ -243,9 +220,11 @@ class Samples:
         view_sets = [visit.view_set for visits in steps for visit in visits]
         self._left = Counter(sample_key(view_set, recipe) for view_set in view_sets)
         self._kept: dict[SampleKey, Sample] = {}
-        self._folder = _own_folder(folder) if place == "disk" else None
-        self._files = 0
-        self._tokens = self._embedded(scenes, distinct(view_sets, recipe))
+        self._folder, self._files = None, 0
+        if place == "disk":
+            home = tempfile.mkdtemp(prefix="freegeo-samples-") if folder is None else scratch_folder(folder, "samples")
+            self._folder = Path(home)
+        self._tokens = self._embedded(distinct(view_sets, recipe))
 
     def take(self, visit: Visit) -> Sample:
         """Return the sample of a visit, on the device; visits come in the order of `steps`."""
@@ -255,7 +234,7 @@ class Samples:
         if sample is None:
             sample = self._make(visit)
             if self._left[key] and self._folder is not None:
-                sample = self._in_file(sample)
+                sample = sample.map(self._in_file)
         if self._left[key]:
             self._kept[key] = sample
         return sample.to(self._compute.device)
@@ -271,33 +250,34 @@ class Samples:
     def _make(self, visit: Visit) -> Sample:
         """Run the teacher on the views of a set."""
         view_set, config, model = visit.view_set, self._recipe.loss, self._adapter.model
-        tokens, priors = next(self._tokens), self._scenes[view_set.scene].priors
+        scene, tokens = self._scenes[view_set.scene], next(self._tokens)
+        priors, targets = scene.priors, scene.targets if self._recipe.cameras else None
         if priors is not None:
             priors = usable_by_both(priors.select(view_set.frames), view_set.kept, model.spec)
         with self._adapter.off(), self._compute.autocast():
             features = loss_features(model, tokens, priors)
-        read = view_set.positions if self._recipe.sees_all else view_set.kept
-        targets = self._scenes[view_set.scene].targets if self._recipe.cameras else None
-        patches = seen_patches(self._scenes[view_set.scene], view_set, tokens.grid_hw, self._recipe)
-        sample = Sample(
-            tokens=tokens.select(read),
-            # What only the decoder reads is not kept.
-            teacher=replace(features, extra={}).select(read),
+        patches = seen_patches(scene, view_set, tokens.grid_hw, self._recipe)
+        whole = Sample(
+            tokens=tokens,
+            teacher=replace(features, extra={}),  # without what only the decoder reads
             held_out=held_out_tokens(features.levels[max(features.levels)], view_set.kept, config, patches=patches),
-            kept=tuple(read.index(position) for position in view_set.kept),
-            patches=None if patches is None else patches[list(read)],
-            targets=None if targets is None else targets.select([view_set.frames[position] for position in read]),
-            priors=None if priors is None else priors.select(read),
+            kept=view_set.kept,
+            patches=patches,
+            targets=None if targets is None else targets.select(view_set.frames),
+            priors=priors,
         )
+        # The selection is a copy, also of all views: it keeps nothing of the network's alive.
+        sample = whole.select(range(len(view_set.frames)) if self._recipe.sees_all else view_set.kept)
         measured = self._recipe.features and config.uses_distances and config.pairing == "all"
         if self._compute.device.type == "cpu" or not measured:
             return sample
         # Read once per view set instead of in every step, where an accelerator would have to wait for it.
-        levels, draws = sample.student()[1], step_draws(sample, visit, config, seed=self._seed)
+        student = sample.student()
+        draws, levels = step_draws(student, visit.step, config, seed=self._seed), student.teacher.levels
         spread = teacher_spread(levels[max(levels)], sample.held_out, draws, config)
         return replace(sample, form=choose_form(float(spread), headroom=SPREAD_HEADROOM))
 
-    def _embedded(self, scenes: Sequence[SceneImages], view_sets: Sequence[ViewSet]) -> Generator[ViewTokens]:
+    def _embedded(self, view_sets: Sequence[ViewSet]) -> Generator[ViewTokens]:
         """Yield the tokens (1, N, ...) of view sets in order; an image that several sets use is embedded once."""
         fresh, left = [], Counter[ViewKey]()
         for view_set in view_sets:
@@ -307,7 +287,7 @@ class Samples:
         requests = [(s.scene, [s.frames[p] for p in positions]) for s, positions in zip(view_sets, fresh, strict=True)]
         device, layers = self._compute.device, self._adapter.model.spec.loss_layers
         waiting: dict[ViewKey, ViewTokens] = {}
-        with closing(loaded_ahead(scenes, [request for request in requests if request[1]])) as images:
+        with closing(loaded_ahead(self._scenes, [request for request in requests if request[1]])) as images:
             for view_set, positions in zip(view_sets, fresh, strict=True):
                 keys = view_keys(view_set, self._recipe)
                 if positions:
@@ -323,17 +303,17 @@ class Samples:
                 waiting = {key: view for key, view in waiting.items() if left[key]}
                 yield tokens
 
-    def _in_file(self, sample: Sample) -> Sample:
-        """Write a sample to a file and return it with memory-mapped tensors, which are read when they are used."""
+    def _in_file(self, tensor: Tensor) -> Tensor:
+        """Write a tensor to a file of its own and return it memory-mapped: it is read when it is used."""
         from safetensors import safe_open
         from safetensors.torch import save_file
 
         assert self._folder is not None
         path = self._folder / f"{self._files}.safetensors"
         self._files += 1
-        save_file({name: tensor.cpu().contiguous() for name, tensor in sample.tensors().items()}, path)
+        save_file({"": tensor.cpu().contiguous()}, path)
         with safe_open(path, framework="pt") as file:
-            return sample.with_tensors({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
+            return file.get_tensor("")
 
 
 ViewKey = tuple[int, ...]
@@ -370,18 +350,18 @@ def step_seed(seed: int, step: int) -> int:
     return (seed * STEP_SEED_STRIDE + step) % 2**64
 
 
-def step_draws(sample: Sample, visit: Visit, config: LossConfig, *, seed: int) -> StepDraws:
-    """Draw the tokens of a visit; the random numbers depend on seed and step alone."""
-    patch, special = sample.teacher.levels[max(sample.teacher.levels)]
+def step_draws(student: Sample, step: int, config: LossConfig, *, seed: int) -> StepDraws:
+    """Draw the tokens of a step from a sample of the student's views; the random numbers depend on seed and step."""
+    patch, special = student.teacher.levels[max(student.teacher.levels)]
     return draw_tokens(
         config,
         tokens_per_view=patch.shape[2] + (special.shape[2] if config.cross_tokens == "all" else 0),
-        student_views=len(visit.view_set.kept),
-        held_out_views=len(visit.view_set.frames) - len(visit.view_set.kept),
-        generator=torch.Generator().manual_seed(step_seed(seed, visit.step)),
-        patches=sample.student_patches(),
-        held_out_count=sample.held_out.shape[1],
-    ).to(patch.device)
+        student_views=len(student.kept),
+        held_out=student.held_out.shape[1],
+        generator=torch.Generator().manual_seed(step_seed(seed, step)),
+        patches=student.patches,
+        device=patch.device,
+    )
 
 
 def loaded_ahead(scenes: Sequence[SceneImages], requests: Iterable[tuple[int, Sequence[int]]]) -> Generator[Tensor]:
@@ -399,8 +379,3 @@ def loaded_ahead(scenes: Sequence[SceneImages], requests: Iterable[tuple[int, Se
             yield running.popleft().result()
     finally:
         thread.shutdown(cancel_futures=True)
-
-
-def _own_folder(parent: Path | None) -> Path:
-    """Return an empty folder for the files of a run."""
-    return Path(tempfile.mkdtemp(prefix="freegeo-samples-")) if parent is None else scratch_folder(parent, "samples")

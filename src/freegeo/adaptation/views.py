@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import random
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +12,8 @@ import torch
 
 from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
 from freegeo.errors import UserError
+
+logger = logging.getLogger(__name__)
 
 EPOCH_SEED_STRIDE = 1_000_000
 Windows = tuple[tuple[int, ...], ...]
@@ -28,11 +31,6 @@ class ViewSet:
     kept: tuple[int, ...]
     """Positions in `frames` that the student sees."""
     seed: int
-
-    @property
-    def positions(self) -> tuple[int, ...]:
-        """Positions in `frames` that the teacher sees: all of them."""
-        return tuple(range(len(self.frames)))
 
 
 def chunk_windows(chunks: Sequence[Sequence[int]]) -> Windows:
@@ -90,7 +88,7 @@ def kept_positions(views: int, keep: tuple[int, ...] | None) -> tuple[int, ...]:
     return keep if fits else tuple(range(0, views, 2))
 
 
-def substitution(frame_counts: Sequence[int], recipe: Recipe, parts: str = "scenes") -> str | None:
+def _substitution(frame_counts: Sequence[int], recipe: Recipe, parts: str) -> str | None:
     """Say what is done instead where scenes have fewer photos than a view set has views; None where all have enough.
 
     `parts` is what several of those that photos are drawn from are called.
@@ -176,3 +174,25 @@ def schedule(
             steps.append([Visit(step=len(steps), epoch=epoch, view_set=sets[i]) for i in batch])
         epoch += 1
     return steps[: recipe.steps]
+
+
+def announced_schedule(
+    frame_counts: Sequence[int], recipe: Recipe, seed: int, *, windows: Sequence[Windows | None]
+) -> list[list[Visit]]:
+    """Return `schedule`, and say what the photos make different from what was asked for."""
+    sizes = [len(window) for parts in windows for window in parts or ()]
+    if said := _substitution(sizes or frame_counts, recipe, "parts of the sequence" if sizes else "scenes"):
+        logger.info(said)
+    steps = schedule(frame_counts, recipe, seed, windows=windows)
+    visits = sum(len(step) for step in steps)
+    if visits < len(sizes):
+        logger.info(
+            "%d view sets cannot visit all %d parts of the sequence; which are left out depends on the seed. More "
+            "--steps visit all.", visits, len(sizes),
+        )  # fmt: skip
+    return steps
+
+
+def visited(steps: Sequence[Sequence[Visit]]) -> Sequence[Sequence[Visit]]:
+    """Return the visits of a run's steps and then those of its last step again, for the look at what came out."""
+    return [*steps, steps[-1]]

@@ -21,12 +21,13 @@ from typing import Any, Required, TypedDict
 
 import torch
 
-from freegeo.adaptation.adapt import Adapted, Progress, adapt
+from freegeo.adaptation.adapt import adapt
+from freegeo.adaptation.adapted import Adapted
 from freegeo.adaptation.adapter import Adapter, count_trainable
 from freegeo.adaptation.adapter_files import load_adapter, save_adapter
 from freegeo.adaptation.recipe import SMALLEST_SCENE, Recipe
 from freegeo.adaptation.samples import SceneImages
-from freegeo.adaptation.state import remove_state
+from freegeo.adaptation.state import Progress, remove_state
 from freegeo.adaptation.views import schedule
 from freegeo.benchmark.tasks import DAMAGED, Problem, reason_of
 from freegeo.data.datasets.registry import load_scene

@@ -15,10 +15,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from freegeo.adaptation import recipe as recipes
-from freegeo.adaptation.adapt import Progress
 from freegeo.adaptation.adapter import Adapter
-from freegeo.adaptation.memory import plan_reconstruction
 from freegeo.adaptation.recipe import Recipe
+from freegeo.adaptation.state import Progress
 from freegeo.benchmark.adapters import AdapterJob, peak_memory_gb, reset_peak_memory, train, use
 from freegeo.benchmark.frames import require_truth
 from freegeo.benchmark.paper.variants import Variant, variant
@@ -43,6 +42,7 @@ from freegeo.geometry.camera import resize_K
 from freegeo.models.api import ReconstructionModel, embed_in_chunks
 from freegeo.models.catalog import load_model
 from freegeo.models.images import chosen_side, read_some
+from freegeo.models.memory import plan_reconstruction
 from freegeo.models.precision import Compute, Precision
 from freegeo.types import Features, ImageBatch, Prediction, Priors, ViewTokens
 

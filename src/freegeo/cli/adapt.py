@@ -54,7 +54,7 @@ def adapt(
         select: matches between the photos decide which state of the adapter is saved; report: they are only asked;
         off.
     """
-    from freegeo.adaptation.adapt import require_unchanged_images
+    from freegeo.adaptation.recipe import require_unchanged_images
     from freegeo.data.photos import MAX_VIEWS
     from freegeo.errors import UserError
     from freegeo.models.images import chosen_side, read_photos

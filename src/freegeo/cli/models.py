@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import App, Parameter
 
 from freegeo.cli import console
 from freegeo.host import gigabytes
 from freegeo.models import catalog
+from freegeo.models.spec import ModelEntry
 from freegeo.progress import progress_bar
-
-if TYPE_CHECKING:
-    from freegeo.adaptation.needs import ModelNeeds
-    from freegeo.models.spec import ModelEntry
 
 app = App(name="models", help="List, describe, download and check models.", help_format="plaintext")
 TABLE_WIDTH = 100
 RANKS = (8, 16, 32, 64)
+VIEWS = (8, 32, 100)
+"""Numbers of photos whose reconstruction is planned."""
+ADAPTED_VIEWS = 8
 TAKES = {
     "nothing": "photos alone; known cameras are used afterwards",
     "cameras": "photos, and the poses together with the intrinsics of all of them",
@@ -26,12 +28,60 @@ TAKES = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class ModelNeeds:
+    """What a model needs, in bytes; memory as the planner predicts it for photos of 4:3 on a GPU in bf16."""
+
+    entry: ModelEntry
+    """Name, licence, description, and where the weights are."""
+    parameters: int
+    """Parameters in memory; parts of a checkpoint that are not built do not count."""
+    download: int | None
+    """Size of the download; None: the weights are in the package, or are given with --checkpoint."""
+    image_hw: tuple[int, int]
+    """Size of a photo of 4:3 after preprocessing."""
+    reconstruct: Mapping[int, int]
+    """Number of photos -> memory of reconstructing them together."""
+    adapt: tuple[int, int] | None
+    """Memory of adapting to 8 photos, as fast as possible and as small; None: the model cannot be adapted."""
+
+
+def needs_of(name: str) -> ModelNeeds:
+    """Return what one model needs, also for the table in the docs. Errors as `catalog.entry`, `catalog.build_empty`."""
+    import torch
+
+    from freegeo.adaptation.memory import Footprint
+    from freegeo.adaptation.recipe import scene
+    from freegeo.models.memory import plan_reconstruction
+    from freegeo.models.precision import Compute
+
+    item, model = catalog.entry(name), catalog.build_empty(name)
+    gpu = Compute(device=torch.device("cuda"), precision="bf16")  # which need not be there to plan for it
+    side, patch = model.spec.default_side, model.spec.patch_size
+    image_hw = round(side * 3 / 4 / patch) * patch, side
+    parameters = sum(parameter.numel() for parameter in model.parameters())
+    # A budget that no result exceeds; the planner takes long for one that is far larger.
+    plans = {
+        views: plan_reconstruction(model, views, image_hw, compute=gpu, budget=1000 * parameters) for views in VIEWS
+    }
+    adapt = None
+    if model.cross_view is not None:
+        job = Footprint.of_scene(model, ADAPTED_VIEWS, image_hw, scene(model.spec), gpu)
+        adapt = job.plan("device", checkpointing=False).peak_bytes, job.plan("disk", checkpointing=True).peak_bytes
+    return ModelNeeds(
+        entry=item,
+        parameters=parameters,
+        download=None if item.hub_id is None else item.download_bytes,
+        image_hw=image_hw,
+        reconstruct={views: sum(size for _, size in parts) for views, (parts, _) in plans.items()},
+        adapt=adapt,
+    )
+
+
 @app.default
 def list_models() -> None:
     """List all models that can be used."""
-    from freegeo.adaptation.needs import VIEWS, model_needs
-
-    found = model_needs()
+    found = catalog.for_each(needs_of)
     about = [(needs.entry.name, _about(needs.entry)) for needs in found]
     console.say(console.table(("model", "about"), about, prose=TABLE_WIDTH))
     header = ("model", "parameters", "licence", "download", *(f"{views} views" for views in VIEWS))
@@ -68,7 +118,6 @@ def describe(model: str) -> None:
         Name or hub id of a model.
     """
     from freegeo.adaptation.adapter import count_trainable
-    from freegeo.adaptation.needs import ADAPTED_VIEWS, needs_of
 
     needs = needs_of(model)
     item, built, (height, width) = needs.entry, catalog.build_empty(model), needs.image_hw

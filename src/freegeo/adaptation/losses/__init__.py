@@ -5,17 +5,15 @@ forms of the three terms: `intra`, `angles`, `divergence`. `cameras` is a term o
 `freegeo.adaptation.recipe`.
 """
 
-from freegeo.adaptation.losses.assemble import adaptation_loss, feature_distance, not_finite, teacher_spread
+from freegeo.adaptation.losses.assemble import adaptation_loss, feature_distance, teacher_spread
 from freegeo.adaptation.losses.cameras import CameraTargets, camera_loss
 from freegeo.adaptation.losses.divergence import KLForm, choose_form
 from freegeo.adaptation.losses.sampling import Level, StepDraws, TokenDraw, draw_tokens, held_out_tokens
-from freegeo.adaptation.recipe import LossConfig
 
 __all__ = [
     "CameraTargets",
     "KLForm",
     "Level",
-    "LossConfig",
     "StepDraws",
     "TokenDraw",
     "adaptation_loss",
@@ -24,6 +22,5 @@ __all__ = [
     "draw_tokens",
     "feature_distance",
     "held_out_tokens",
-    "not_finite",
     "teacher_spread",
 ]

@@ -7,21 +7,14 @@ since the squared sides of a triangle give its angles:
     n = (q - p) . (k - p) = u . q - u . p          c = |q - k|^2 = a + b - 2 n
     cosines   n / sqrt(a b)  at p        (b - n) / sqrt(b c)  at k        (a - n) / sqrt(a c)  at q
 
-Why float64, and edges: a and c are differences of large squared norms. Their error is a few eps of these norms, so the
-cosines at a side of delta times the tokens' norm have a relative error of about 2 eps / delta^2. Near-duplicate views
-have many short sides: at delta = 1e-3 that is 1/4 in float32, and 4e-10 in float64 (4e-6 at 1e-5, 4e-4 at 1e-6). So the
-tokens are widened to float64, which rounds nothing, and everything below is computed in it (`doubled`). Two measures
-more cost nothing: the edge u is formed by subtraction, since an anchor is often close to its reference, and all tokens
-are centred on a common vector, which changes no side but makes the norms small.
+a and c are differences of large squared norms, so that short sides, of which near-duplicate views have many, lose their
+digits: cosines at a side of 1e-3 of the norm are off by 1/4 in float32, by 4e-10 in float64. Everything is therefore
+computed in float64, to which the tokens are widened without rounding (`doubled`). Two measures more cost nothing: the
+edge u is formed by subtraction, since an anchor is often close to its reference, and all tokens are centred on a common
+vector, which changes no side but makes the norms small.
 
-Where the two tokens of a side are equal (repeated frames), what is left of it is rounding and must not be taken for a
-direction. It depends on the order in which a product adds up its C channels: up to 28 eps of the squared norms were
-measured, for C from 64 to 8192 and large and small products. A side counts as zero where
-
-    a <= 64 eps (|p|^2 + |q|^2) = 2^-46 (|p|^2 + |q|^2),    for tokens of equal norm |q - p| <= 2^-22.5 |p| = 1.7e-7 |p|
-
-and c alike. Float32 numbers are 2^-24 to 2^-23 of their size apart, so the bound is the last bit or two of the features
-themselves: every longer side keeps its angles. A side of length zero has cosine 0 at both of its ends and no gradient.
+What is left of a side between equal tokens (repeated frames) is rounding and must not be taken for a direction: up to
+`ZERO_EPS` it counts as zero, has cosine 0 at both of its ends and no gradient. The source below derives the bounds.
 
 Loss and gradient come from one sweep over blocks of references that stay in cache; two arrays of R * K * m live during
 the sweep and none after it. Gradients go first to a, b and n (`_by_squares`), then, by further products, to p and q
@@ -36,7 +29,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from freegeo.adaptation.losses.numerics import block_elements, blocks, doubled, exact_matmul, widened_type
+from freegeo.adaptation.losses.numerics import block_elements, blocks, doubled, exact_matmul, widened
 
 ZERO_EPS = 64
 """A squared side counts as zero up to so many eps of the squared norms that it is a difference of."""
@@ -126,10 +119,9 @@ def _penalty_sum(difference: Tensor, delta: float | None) -> Tensor:
 
 
 def _by_squares(sides: _Triangles, slopes: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients of a block by a = |q-p|^2 (B, r, m), b = |k-p|^2 (B, r, K) and n = (q-p).(k-p) (B, r, K, m).
+    """Gradients of a block by a (B, r, m), b (B, r, K) and n (B, r, K, m), as named above.
 
-    The cosines are n/sqrt(ab), (b-n)/sqrt(bc) and (a-n)/sqrt(ac) with c = |q-k|^2 = a + b - 2n. The last result
-    takes the place of the first slope; the other slopes are overwritten.
+    The last result takes the place of the first slope; the other slopes are overwritten.
     """
     slope_p, slope_k, slope_q = slopes
     inverse_pk, inverse_pq = sides.inverse_pk[..., 0], sides.inverse_pq[:, :, 0]
@@ -198,7 +190,7 @@ class _AngleTerms(torch.autograd.Function):
         delta: float | None,
     ) -> tuple[Tensor, Tensor]:
         ctx.dtypes = p.dtype, q.dtype
-        device, dtype = p.device, widened_type(p)
+        device, dtype = p.device, widened(p[:0]).dtype
         p, q, teacher_p, teacher_q, k = map(doubled, (p, q, teacher_p, teacher_q, k))
         centre = torch.cat([teacher_p, teacher_q, k.flatten(1, 2)], dim=1).mean(1, keepdim=True)
         with exact_matmul(p):

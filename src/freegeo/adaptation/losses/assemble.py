@@ -24,7 +24,6 @@ from freegeo.adaptation.losses.sampling import (
     positions_of,
 )
 from freegeo.adaptation.recipe import LossConfig
-from freegeo.errors import FreeGeoError
 
 
 def adaptation_loss(
@@ -44,21 +43,16 @@ def adaptation_loss(
             intra loss is the mean over layers, the relational loss uses the highest layer number.
         teacher_levels: the same of the teacher, which saw all views; no gradient goes there.
         held_out: (B, L, C), what `held_out_tokens` returned for the highest layer: the tokens that anchors come from.
-        draws: token positions, on any device; on the features' device they need not be copied.
+        draws: token positions, on the features' device.
         config: which version of the loss.
         form: see `all_pairs_divergence`; only `pairing` "all" uses it, and None costs a transfer to the host per term.
         patches: (M, P) bool, on the CPU: patches of the kept views that the intra loss compares; None: all.
 
     Terms: `total`; `intra` (weighted) and its unweighted parts `huber` and `cos` (mean of 1 - cosine); `cross`
     (weighted); unweighted `phi1`, `phi2`, `phi3` (angles at reference, anchor, query) and `phi` (weighted sum);
-    unweighted `kl_pk`, `kl_pq`, `kl_kq`. Terms of weight 0 are absent. Raises `FreeGeoError` where the teacher's
-    layers are not the student's. Source: docs/method.md, "Equations of the paper" and "Paper and released code".
+    unweighted `kl_pk`, `kl_pq`, `kl_kq`. Terms of weight 0 are absent. Source: docs/method.md, "Equations of the
+    paper" and "Paper and released code".
     """
-    if student_levels.keys() != teacher_levels.keys():
-        raise FreeGeoError(
-            f"The student's features come from layers {sorted(student_levels)}, the teacher's from "
-            f"{sorted(teacher_levels)}; ask both branches for the same layers."
-        )
     total, terms = feature_distance(student_levels, teacher_levels, config, patches=patches)
     cross: list[Tensor] = []
     if config.uses_angles or config.uses_distances:
@@ -130,7 +124,7 @@ def _gather_draws(tokens: Tensor, draws: StepDraws, config: LossConfig) -> tuple
     """
     batch, views, per_view, channels = tokens.shape
     chosen = [draws.angle] if draws.shared else [draws.angle, draws.distance]
-    positions = torch.cat([part for draw in chosen for part in _flat_positions(draw, per_view, config, tokens.device)])
+    positions = torch.cat([part for draw in chosen for part in _flat_positions(draw, per_view, config)])
     gathered = widened(tokens.reshape(batch, views * per_view, channels).index_select(1, positions))
     sizes = [size for draw in chosen for size in (draw.reference.numel(), draw.query.numel())]
     parts = gathered.split(sizes, dim=1)
@@ -140,12 +134,11 @@ def _gather_draws(tokens: Tensor, draws: StepDraws, config: LossConfig) -> tuple
     return per_draw[0], per_draw[-1]
 
 
-def _flat_positions(draw: TokenDraw, per_view: int, config: LossConfig, device: torch.device) -> tuple[Tensor, Tensor]:
+def _flat_positions(draw: TokenDraw, per_view: int, config: LossConfig) -> tuple[Tensor, Tensor]:
     """Positions of references and queries in the concatenation of all the student's views."""
-    reference, query = draw.reference.to(device), draw.query.to(device).flatten()
-    first = config.reference_view * per_view
+    query, first = draw.query.flatten(), config.reference_view * per_view
     # Query positions do not count the reference view, so those behind it are shifted by one view.
-    return reference + first, torch.where(query < first, query, query + per_view)
+    return draw.reference + first, torch.where(query < first, query, query + per_view)
 
 
 def _pooled(tokens: Tokens) -> Tokens:
@@ -162,37 +155,30 @@ def _distances(
     for name, weight in weights.items():
         if not weight:
             continue
-        if name == "kl_pk":
-            value = _reference_anchor(student, teacher, anchors, config)
-        elif config.pairing == "paired":
-            value = _paired(name, student, teacher, anchors, config)
+        if name == "kl_pk" or config.pairing == "paired":
+            value = _listed(name, student, teacher, anchors, config)
         else:
             value = _all_pairs(name, student, teacher, anchors, config, form)
         values[name] = (weight, value)
     return values
 
 
-def _pairs(tokens: Tokens) -> int:
-    """Number of pairs per row of `pairing` "paired"; references beyond it take part in no distance term."""
-    return min(tokens[0].shape[1], tokens[1].shape[2])
+def _listed(name: str, student: Tokens, teacher: Tokens, anchors: Tensor, config: LossConfig) -> Tensor:
+    """Each reference with its own anchors, or the i-th reference (or its anchors) with the i-th query of every row.
 
-
-def _reference_anchor(student: Tokens, teacher: Tokens, anchors: Tensor, config: LossConfig) -> Tensor:
-    used = _pairs(student) if config.pairing == "paired" else None
-    differences = [p[:, :used, None] - anchors[:, :used] for p, _ in (student, teacher)]
-    return _of_differences(*differences, config)
-
-
-def _paired(name: str, student: Tokens, teacher: Tokens, anchors: Tensor, config: LossConfig) -> Tensor:
-    """The i-th reference (or its anchors) with the i-th query of every row."""
-    pairs = _pairs(student)
-    if name == "kl_pq":
-        differences = [p[:, None, :pairs] - q[:, :, :pairs] for p, q in (student, teacher)]
-    else:
-        sign = 1 if config.kq_order == "kq" else -1
-        k = anchors[:, None, :pairs]
-        differences = [sign * (k - q[:, :, :pairs, None]) for _, q in (student, teacher)]
-    return _of_differences(*differences, config)
+    With `pairing` "paired" references beyond the number of queries in a row take part in no term.
+    """
+    used = min(student[0].shape[1], student[1].shape[2]) if config.pairing == "paired" else None
+    k, sign = anchors[:, :used], 1 if config.kq_order == "kq" else -1
+    of = {
+        "kl_pk": lambda p, q: p[:, :used, None] - k,
+        "kl_pq": lambda p, q: p[:, None, :used] - q[:, :, :used],
+        "kl_kq": lambda p, q: sign * (k[:, None] - q[:, :, :used, None]),
+    }[name]
+    found, wanted = of(*student), of(*teacher)
+    if config.distance_mode == "huber":
+        return F.smooth_l1_loss(found, wanted, beta=config.distance_beta)
+    return _outer(paired_divergence(found, wanted, temperature=config.temperature), config).mean()
 
 
 def _all_pairs(
@@ -201,18 +187,12 @@ def _all_pairs(
     """Every reference (or every anchor of every reference) with every query."""
     student, teacher = _pooled(student), _pooled(teacher)
     if name == "kl_kq":
-        k = anchors.flatten(1, 2)
-        student, teacher = (k, student[1]), (k, teacher[1])
-        if config.kq_order == "qk":
-            student, teacher = student[::-1], teacher[::-1]
+        # In the order "qk" q - k is taken as -k - (-q): both branches share the first tokens, which saves a product.
+        turned = config.kq_order == "qk"
+        k, q, teacher_q = (-t if turned else t for t in (anchors.flatten(1, 2), student[1], teacher[1]))
+        student, teacher = (k, q), (k, teacher_q)
     kl = all_pairs_divergence(student, teacher, temperature=config.temperature, form=form)
     return _outer(kl, config).mean()
-
-
-def _of_differences(student: Tensor, teacher: Tensor, config: LossConfig) -> Tensor:
-    if config.distance_mode == "huber":
-        return F.smooth_l1_loss(student, teacher, beta=config.distance_beta)
-    return _outer(paired_divergence(student, teacher, temperature=config.temperature), config).mean()
 
 
 def _outer(kl: Tensor, config: LossConfig) -> Tensor:
@@ -230,9 +210,3 @@ def teacher_spread(kept: Level, held_out: Tensor, draws: StepDraws, config: Loss
     p, q = _pooled(_gather_draws(cross_tokens(config, kept), draws, config)[1])
     anchors = widened(anchor_tokens(kept, held_out, draws, config)[1]).flatten(1, 2)
     return torch.stack([pair_spread(x, q, config.temperature) for x in (p, anchors)]).amax()
-
-
-def not_finite(terms: Mapping[str, Tensor]) -> str | None:
-    """Return the name of the first term of `terms` (scalars) that is not finite, if any; one transfer to the host."""
-    finite = torch.stack([term.detach().float() for term in terms.values()]).isfinite().tolist()
-    return next((name for name, is_finite in zip(terms, finite, strict=True) if not is_finite), None)

@@ -153,13 +153,11 @@ def all_pairs_divergence(
     """KL(softmax((x' - y')/tau) || softmax((x - y)/tau)) for every pair, (B, R, m), in float32 or wider.
 
     student: (x (B, R, C), y (B, m, C)); teacher: (x', y') of the same shapes. Passing one tensor object as x and x'
-    (or as y and y') saves its products; the gradient goes to the student's tensors. form None measures the
-    spread of the softmax inputs, which reads one number back to the host; a given `float32` or `float64` is not
-    checked and yields non-finite values where the spread is too large for it.
+    saves its products; the gradient goes to the student's tensors. form None measures the spread of the softmax inputs,
+    which reads one number back to the host; a given `float32` or `float64` is not checked and yields non-finite values
+    where the spread is too large for it.
     """
-    same_x, same_y = student[0] is teacher[0], student[1] is teacher[1]
-    if same_y and not same_x:
-        return _transposed(student, teacher, temperature=temperature, form=form)
+    same_x = student[0] is teacher[0]
     x, y = map(widened, student)
     teacher_x, teacher_y = (widened(tensor).detach() for tensor in teacher)
     device, wide = x.device, x.dtype
@@ -179,15 +177,6 @@ def all_pairs_divergence(
     if form == "direct":
         return _DirectPairs.apply(x, y, teacher_x, teacher_y)
     return _ProductPairs.apply(x, y, teacher_x, teacher_y, same_x).to(device, wide)
-
-
-def _transposed(
-    student: tuple[Tensor, Tensor], teacher: tuple[Tensor, Tensor], *, temperature: float, form: KLForm | None
-) -> Tensor:
-    """Pairs that share y instead of x: x - y = (-y) - (-x)."""
-    shared = -teacher[1]
-    flipped = all_pairs_divergence((shared, -student[0]), (shared, -teacher[0]), temperature=temperature, form=form)
-    return flipped.mT
 
 
 class _PairedKL(torch.autograd.Function):

@@ -31,14 +31,9 @@ def blocks(length: int, size: int) -> Iterator[slice]:
         yield slice(start, min(start + step, length))
 
 
-def widened_type(tensor: Tensor) -> torch.dtype:
-    """The type that a loss of `tensor` is given in: float32, or float64 where the tensor has it."""
-    return torch.float64 if tensor.dtype == torch.float64 else torch.float32
-
-
 def widened(tensor: Tensor) -> Tensor:
-    """`tensor` in float32, or unchanged where it is float64 already."""
-    return tensor.to(widened_type(tensor))
+    """`tensor` in float32, or unchanged where it is float64 already: the type that its loss is given in."""
+    return tensor if tensor.dtype == torch.float64 else tensor.float()
 
 
 def doubled(tensor: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ One draw is shared by the samples of a batch (docs/method.md, "Token draws").
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -35,12 +35,10 @@ def held_out_tokens(level: Level, kept: Sequence[int], config: LossConfig, *, pa
     """The tokens (B, L, C) that anchors are chosen from: those of the views that the student does not see.
 
     level: the teacher's features of the cross layer, all N views; kept: the student's views among them; patches (N, P)
-    bool: those that show a photo, None: all. UserError where the student sees every view.
+    bool: those that show a photo, None: all.
     """
     tokens = cross_tokens(config, level)
     views = [view for view in range(tokens.shape[1]) if view not in set(kept)]
-    if not views:
-        raise UserError("The student keeps every view of the teacher; hold out at least one for the anchors.")
     held_out = tokens[:, views].flatten(1, 2)
     if patches is None:
         return held_out
@@ -70,11 +68,6 @@ class TokenDraw:
     """(R, K) or (B, R, K) int64: positions in the concatenation of the held-out views (ascending, T tokens each).
     None: the anchors are found by similarity."""
 
-    def to(self, device: torch.device | str) -> "TokenDraw":
-        """The same draw on another device."""
-        anchor = None if self.anchor is None else sent(self.anchor, device)
-        return replace(self, reference=sent(self.reference, device), query=sent(self.query, device), anchor=anchor)
-
 
 @dataclass(frozen=True, kw_only=True)
 class StepDraws:
@@ -88,51 +81,43 @@ class StepDraws:
         """Whether the angle terms and the distance terms use one draw."""
         return self.angle is self.distance
 
-    def to(self, device: torch.device | str) -> "StepDraws":
-        """The same draws on another device."""
-        angle = self.angle.to(device)
-        return StepDraws(angle=angle, distance=angle if self.shared else self.distance.to(device))
-
 
 def draw_tokens(
     config: LossConfig,
     *,
     tokens_per_view: int,
     student_views: int,
-    held_out_views: int,
+    held_out: int,
     generator: torch.Generator,
     patches: Tensor | None = None,
-    held_out_count: int | None = None,
+    device: torch.device | str = "cpu",
 ) -> StepDraws:
-    """Draw the references and queries of one step (CPU tensors).
+    """Draw the references and queries of one step on the CPU, and send them to `device`.
 
     tokens_per_view: tokens that `config.cross_tokens` lets take part (patches, or special tokens and patches).
-    Where a view has fewer tokens than asked for, all are drawn. `patches` (M, P) bool, on the CPU, are those of the
-    student's views that show a photo, and `held_out_count` the number of such tokens of the held-out views; only these
-    are drawn. None: all. The generator is read in this order: references,
-    queries and, for random selection, anchors of the angle draw; then the same for a separate distance draw.
-    Raises `UserError` where the views cannot form a triplet.
+    Where there are fewer tokens than asked for, all are drawn. held_out: number of tokens of `held_out_tokens`.
+    `patches` (M, P) bool, on the CPU, are those of the student's views that show a photo; only these are drawn. None:
+    all. The generator is read in this order: references, queries and, for random selection, anchors of the angle draw;
+    then the same for a separate distance draw. Raises `UserError` where the views cannot form a triplet.
     """
     if not 0 <= config.reference_view < student_views:
         raise UserError(
             f"Loss setting reference_view is {config.reference_view}, but the student sees {student_views} views; "
             "choose a view that it sees."
         )
-    if student_views < 2 or held_out_views < 1:
-        raise UserError(
-            f"The relational loss needs 2 kept views and 1 held-out view, not {student_views} and {held_out_views}; "
-            "use at least 3 views."
-        )
     if patches is None:
         seen = torch.ones(student_views, tokens_per_view, dtype=torch.bool)
     else:
         seen = _cross_mask(patches, tokens_per_view)
-    held_out = held_out_views * tokens_per_view if held_out_count is None else held_out_count
-    angle = _draw(config, seen, held_out, generator)
-    return StepDraws(angle=angle, distance=_draw(config, seen, held_out, generator) if config.separate_draws else angle)
+    angle = distance = _draw(config, seen, held_out, generator, device)
+    if config.separate_draws:
+        distance = _draw(config, seen, held_out, generator, device)
+    return StepDraws(angle=angle, distance=distance)
 
 
-def _draw(config: LossConfig, seen: Tensor, held_out: int, generator: torch.Generator) -> TokenDraw:
+def _draw(
+    config: LossConfig, seen: Tensor, held_out: int, generator: torch.Generator, device: torch.device | str
+) -> TokenDraw:
     """Draw among the tokens (M, T) that are seen, and from `held_out` tokens of the other views."""
     others = torch.cat([seen[: config.reference_view], seen[config.reference_view + 1 :]])
     reference = _some(seen[config.reference_view], config.num_reference, generator)
@@ -145,9 +130,8 @@ def _draw(config: LossConfig, seen: Tensor, held_out: int, generator: torch.Gene
         raise UserError("The photos of a view set show no patch in common: all is padding. Adapt with --mixed crop.")
     anchor = None
     if config.selection == "random":
-        shape = (len(reference), config.num_anchors)
-        anchor = torch.randint(held_out, shape, generator=generator)
-    return TokenDraw(reference=reference, query=query, anchor=anchor)
+        anchor = sent(torch.randint(held_out, (len(reference), config.num_anchors), generator=generator), device)
+    return TokenDraw(reference=sent(reference, device), query=sent(query, device), anchor=anchor)
 
 
 def _some(seen: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -162,11 +146,9 @@ def search_anchors(reference: Tensor, held_out: Tensor, *, num_anchors: int, sel
 
     reference: (B, R, C); held_out: (B, L, C), the held-out views one after another. `topk`: the K most similar,
     best first; `mixed`: the K//2 most similar, best first, then the K - K//2 least similar, worst first
-    (docs/method.md, "Anchors").
-    Raises `UserError` where there are fewer than K tokens, or for `random`, whose anchors belong to the draw.
+    (docs/method.md, "Anchors"); the anchors of `random` belong to the draw. `UserError` where there are fewer than K
+    tokens.
     """
-    if selection == "random":
-        raise UserError("Random anchors are part of the token draw; make the draw with selection 'random'.")
     if held_out.shape[1] < num_anchors:
         raise UserError(
             f"The held-out views have {held_out.shape[1]} tokens, fewer than the {num_anchors} anchors per reference; "
@@ -192,8 +174,8 @@ def anchor_positions(kept: Level, held_out: Tensor, draw: TokenDraw, config: Los
     than anchors.
     """
     if draw.anchor is not None:
-        return draw.anchor.to(held_out.device).expand(len(held_out), -1, -1)
-    reference = cross_tokens(config, kept)[:, config.reference_view, draw.reference.to(held_out.device)]
+        return draw.anchor.expand(len(held_out), -1, -1)
+    reference = cross_tokens(config, kept)[:, config.reference_view, draw.reference]
     return search_anchors(reference, held_out, num_anchors=config.num_anchors, selection=config.selection)
 
 
