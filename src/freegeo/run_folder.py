@@ -45,6 +45,8 @@ class _State(TypedDict, total=False):
     settings: Required[dict[str, Any]]
     finished: Required[str | None]
     notes: dict[str, Any] | None
+    clearing: bool
+    """Its files are being removed for a run with `overwrite`; a state that is written after that does not say so."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +260,7 @@ def clear(path: Path, *, keep: Callable[[str], bool] = lambda name: False) -> No
     state = stored_state(path)
     if state is not None:
         # If the removal is interrupted, the remaining files must not count as a finished result.
-        write_json(path / RUN_FILE, {**state, "finished": None})
+        write_json(path / RUN_FILE, {**state, "finished": None, "clearing": True})
     names = ledger(path)
     kept = [name for name in names if keep(name) and not is_part(Path(name))]
     remove_listed(path, set(names) - set(kept))

@@ -236,10 +236,11 @@ def test_places_that_are_taken_are_refused(freegeo, photo_folder, tiny, tmp_path
 class HerePool:
     """Works in this process, as a worker of ray does; the first start of a scene in `dies` is its worker's death.
 
-    It dies before it has looked at the folder of the scene, or, with `dies_late`, when it has begun to replace it.
+    It dies before it has looked at the folder of the scene, or, with `dies_when`, when its state is that of an unfinished run
+    (``begun``), or when it removes there what was made with other options (``clearing``).
     """
 
-    dies_late = False
+    dies_when = ""
 
     def __init__(self, out, dies=()):
         self.work, self.dies, self.running, self.commands = partial(_in_worker, out), set(dies), [], []
@@ -259,8 +260,9 @@ class HerePool:
             return []
         item, again = self.running.pop(0)
         if str(item) in self.dies and not again:
-            if self.dies_late and item.state.is_file():
-                write_json(item.state, {**read_json(item.state), "finished": None})
+            if self.dies_when and item.state.is_file():
+                left = {"settings": {"made": "otherwise"}, "clearing": True} if self.dies_when == "clearing" else {}
+                write_json(item.state, {**read_json(item.state), "finished": None, **left})
             return [(item, pools.Died("SIGKILL"))]
         code = self.work(item, again)
         # Messages went to the log, which is closed; another process would have handlers of its own.
@@ -331,8 +333,8 @@ def test_scenes_fail_on_their_own_and_the_same_command_continues(freegeo, here, 
 
 def test_a_retry_overwrites_what_is_old_and_not_what_it_continues(freegeo, here, rooms, tiny, tmp_path, monkeypatch):
     command = ["batch", rooms / "room-0", "-o", tmp_path / "out", *tiny, *FROZEN, "--overwrite"]
-    for late, overwrites in ((False, True), (True, False)):
-        monkeypatch.setattr(HerePool, "dies_late", late)
+    for when, overwrites in (("", True), ("begun", False), ("clearing", True)):
+        monkeypatch.setattr(HerePool, "dies_when", when)
         assert freegeo(*command).code == 0
         assert ["--overwrite" in arguments for arguments in here[-1].commands] == [True, overwrites]
 

@@ -70,9 +70,10 @@ class _Work:
     def command(self, *, again: bool) -> list[str]:
         """Return the arguments of `freegeo`.
 
-        After a death --overwrite is left out where the dead process had begun to overwrite, so that it is continued.
+        After a death --overwrite is left out where the dead process had removed what was there, so that it is continued.
         """
-        begun = again and _written(self.state) != self.before
+        state = stored_state(self.state.parent) if again and _written(self.state) != self.before else None
+        begun = state is not None and not state.get("clearing")
         return [*self.arguments, *(["--overwrite"] if self.overwrite and not begun else [])]
 
     def __str__(self) -> str:
