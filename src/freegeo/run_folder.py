@@ -179,7 +179,7 @@ def _open(lock: Lock, settings: Mapping[str, Any], overwrite: bool, parts: Seque
         same = before["settings"] == settings
         if same and not overwrite:
             return RunFolder(path, lock, settings, before["finished"], before.get("notes") or {})
-        kept = [] if same else parts[: _unchanged(before["settings"], settings, parts)]
+        kept = kept_parts(before["settings"], settings, parts)
         _require_free(path, [part for part in parts if part not in kept])
         clear(path, keep=lambda name: any(part.owns(name) for part in kept))
         notes = {part.name: before["notes"][part.name] for part in kept if part.name in (before.get("notes") or {})}
@@ -195,6 +195,12 @@ def _require_free(path: Path, parts: Sequence[Part]) -> None:
         strangers = sorted(f for f in there if f.is_file() and f.parent.resolve() / f.name not in own)
         if strangers:
             raise UserError(f"{strangers[0]}: freegeo did not write it, and it is in the way. Move or remove it.")
+
+
+def kept_parts(before: Mapping[str, Any], settings: Mapping[str, Any], parts: Sequence[Part]) -> Sequence[Part]:
+    """Return the parts whose files stay when a run with JSON-like settings replaces the one of before."""
+    now = as_json(settings)
+    return () if before == now else parts[: _unchanged(before, now, parts)]
 
 
 def _unchanged(before: Mapping[str, Any], now: Mapping[str, Any], parts: Sequence[Part]) -> int:
