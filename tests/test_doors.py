@@ -194,9 +194,11 @@ def test_a_plugin_that_does_not_load_hides_no_other_model(monkeypatch, capsys):
     ("error", "what"),
     [
         (MemoryError(), "of this machine"), (torch.OutOfMemoryError("CUDA out of memory. Tried"), "of the device"),
+        (RuntimeError("MPS backend out of memory (MPS allocated: 9 GB)"), "of the device"),
+        (RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"), "of the device"),
         (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried"), "of this machine"),
     ],
-    ids=["python", "device", "torch"],
+    ids=["python", "device", "mps", "cublas", "torch"],
 )  # fmt: skip
 def test_exhausted_memory_says_what_to_change(monkeypatch, capsys, error, what):
     def fail(name):

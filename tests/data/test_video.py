@@ -1,5 +1,6 @@
 """Videos are small ones made here: a window that slides over a large random picture."""
 
+from contextlib import contextmanager
 from fractions import Fraction
 
 import av
@@ -331,3 +332,32 @@ def test_frames_that_are_larger_than_the_header_says_are_not_decoded(tmp_path, m
     monkeypatch.setattr(video, "MAX_PIXELS", WIDTH * HEIGHT)
     assert {candidate.size_hw for candidate in collect_candidates(both, slot_s=0.01)} == {(HEIGHT, WIDTH)}
     assert "damaged frames are left out" in caplog.text
+
+
+class Unseekable:
+    """A container in which nothing can be sought."""
+
+    def __init__(self, container, error):
+        self.container, self.error = container, error
+
+    def __getattr__(self, name):
+        return getattr(self.container, name)
+
+    def seek(self, *arguments, **options):
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(1, "not permitted"), av.error.ArgumentError(22, "invalid"), ValueError("x")], ids=repr
+)
+def test_a_file_that_cannot_be_sought_in_is_decoded_from_its_start(tmp_path, monkeypatch, error):
+    frames = load_video(write_video(tmp_path / "a.mkv", [window(4 * k) for k in range(20)]), max_views=3)
+    expected, opened = [frame.read() for frame in frames], video._opened
+
+    @contextmanager
+    def unseekable(path):
+        with opened(path) as container:
+            yield Unseekable(container, error)
+
+    monkeypatch.setattr(video, "_opened", unseekable)
+    assert all(np.array_equal(frame.read(), pixels) for frame, pixels in zip(frames, expected, strict=True))

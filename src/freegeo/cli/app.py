@@ -157,7 +157,8 @@ def out_of_memory(error: BaseException) -> str | None:
     text = " ".join(str(error).split())
     again = "The same command continues an unfinished run."
     of_device = type(error).__name__ in ("OutOfMemoryError", "AcceleratorError") and "out of memory" in text
-    if of_device or "MPS backend out of memory" in text:
+    # The libraries of CUDA (cuBLAS, cuDNN) have an error of their own, which is a plain RuntimeError.
+    if of_device or "MPS backend out of memory" in text or "_STATUS_ALLOC_FAILED" in text:
         return (
             "the memory of the device does not suffice. Use fewer photos (--max-views, --views), smaller images "
             f"(--process-res), --precision bf16 or a smaller --model, or free the device of other work. {again}"
