@@ -2,6 +2,7 @@
 
 import errno
 import os
+import pickle
 import subprocess
 import sys
 import zipfile
@@ -15,6 +16,7 @@ import torch
 from safetensors.torch import save_file
 
 from freegeo import files, host
+from freegeo.cameras.plain import read as read_cameras
 from freegeo.cli.app import checked_config, main, out_of_memory
 from freegeo.cli.demo import read_scores
 from freegeo.errors import DamagedError, FreeGeoError, UserError
@@ -232,3 +234,19 @@ def test_the_code_of_a_mistake_is_kept_where_nothing_can_be_printed():
     with FULL.open("w") as full:
         done = subprocess.run([sys.executable, "-m", "freegeo.cli.app", "run"], stderr=full, check=False)
     assert done.returncode == 2
+
+
+@pytest.mark.parametrize("kind", [FreeGeoError, UserError])
+def test_a_sentence_keeps_the_names_of_files_and_cuts_off_their_content(kind):
+    path = "/".join(["x" * 255] * 8)
+    assert str(kind(f"{path}: no such file.")) == f"{path}: no such file."
+    assert str(kind(f"a.json: '{'1' * 5000}' is no number.")) == f"a.json: '{'1' * 79}... is no number."
+    assert str(pickle.loads(pickle.dumps(kind("x" * 400)))) == f"{'x' * 80}..."
+
+
+@pytest.mark.parametrize("value", [10**299, "1" * 5000, ["x"] * 5000], ids=["number", "text", "list"])
+def test_a_camera_file_is_not_quoted_at_length(tmp_path, value):
+    files.write_json(tmp_path / "cameras.json", {"frames": [{}], "metric": value})
+    with pytest.raises(UserError, match="metric is ") as error:
+        read_cameras(tmp_path / "cameras.json")
+    assert len(str(error.value)) < 300 + len(str(tmp_path))
