@@ -19,6 +19,7 @@ from freegeo import files, host
 from freegeo.cameras.plain import read as read_cameras
 from freegeo.cli.app import checked_config, main, out_of_memory
 from freegeo.cli.demo import read_scores
+from freegeo.data.image_files import UnreadableImageError
 from freegeo.errors import DamagedError, FreeGeoError, UserError
 from freegeo.metrics.scene import PRINTED
 from freegeo.models import catalog
@@ -241,7 +242,14 @@ def test_a_sentence_keeps_the_names_of_files_and_cuts_off_their_content(kind):
     path = "/".join(["x" * 255] * 8)
     assert str(kind(f"{path}: no such file.")) == f"{path}: no such file."
     assert str(kind(f"a.json: '{'1' * 5000}' is no number.")) == f"a.json: '{'1' * 79}... is no number."
-    assert str(pickle.loads(pickle.dumps(kind("x" * 400)))) == f"{'x' * 80}..."
+
+
+@pytest.mark.parametrize(
+    "error", [UserError("a"), DamagedError("a.json", "b", "c"), UnreadableImageError(Path("a.png"), "b")], ids=repr
+)
+def test_an_error_passes_from_a_worker_to_another_process(error):
+    copy = pickle.loads(pickle.dumps(error))
+    assert (type(copy), str(copy), vars(copy)) == (type(error), str(error), vars(error))
 
 
 @pytest.mark.parametrize("value", [10**299, "1" * 5000, ["x"] * 5000], ids=["number", "text", "list"])
