@@ -166,3 +166,66 @@ def calls_of(name: str, tree: ast.Module) -> int:
 @pytest.mark.parametrize("name", DOORS)
 def test_files_from_elsewhere_are_opened_in_one_place(name):
     assert {name_of(file): n for file in FILES if (n := calls_of(name, tree_of(file)))} == {DOORS[name]: 1}
+
+
+WRITERS = {
+    "write_text", "write_bytes", "mkdir", "makedirs", "touch", "unlink", "rmdir", "rmtree", "rename", "move", "symlink",
+    "symlink_to", "hardlink_to", "link", "copyfile", "copy2", "copytree", "truncate", "chmod", "mkdtemp", "mkstemp",
+    "NamedTemporaryFile", "TemporaryDirectory", "extractall", "savez", "savez_compressed", "savetxt", "tofile",
+    "imwrite", "save_file", "savefig",
+}  # fmt: skip
+FROM_A_DOOR = {"part", "buffer", "stream"}
+"""What the temporary paths of files.py are called, and files in memory."""
+WRITES = {
+    **dict.fromkeys(("files.py", "lock.py", "run_folder.py"), "the doors themselves"),
+    # Files and folders whose paths atomic_files, atomic_folder or scratch_folder gave
+    "adaptation/samples.py": 3, "benchmark/download.py": 5, "export/depth_files.py": 5, "export/nerfstudio.py": 3,
+    "export/photos.py": 5,
+    # Lines that are added while something runs
+    "cli/batch.py": 1, "pools.py": 1, "training/loop.py": 1,
+    # Places of their own: the cache of weights, the folder of the app
+    "models/hub.py": 5, "webapp/runs.py": 2, "webapp/sessions.py": 13,
+    # Bytes in memory; no file at all
+    "export/glb.py": 1, "cli/console.py": 2,
+}  # fmt: skip
+"""Where files are changed otherwise than through files.py, and how often."""
+
+
+def changes_files(call: ast.Call) -> bool:
+    """Whether a call makes, changes or removes a file, other than one from a door."""
+    name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+    values = [*call.args, *(keyword.value for keyword in call.keywords)]
+    texts = [value.value for value in values if isinstance(value, ast.Constant) and isinstance(value.value, str)]
+    changes = (
+        name in WRITERS
+        or (name == "open" and any(len(text) < 4 and set("wax+") & set(text) for text in texts))
+        or (name == "replace" and len(call.args) == 1 and not call.keywords)
+        or (name == "export" and any(keyword.arg == "file_type" for keyword in call.keywords))
+        # The rest are methods of our own, such as Reconstruction.save.
+        or (ast.unparse(call.func) in ("np.save", "torch.save"))
+        or (name == "save" and isinstance(call.func, ast.Attribute) and len(values) > 1)
+    )
+    return changes and not any(isinstance(node, ast.Name) and node.id in FROM_A_DOOR for node in ast.walk(call))
+
+
+@pytest.mark.parametrize("file", FILES, ids=name_of)
+def test_writers_go_through_the_doors(file):
+    """A new writer takes its path from files.py, as atomic_path gives it; any other has to be looked at, and listed."""
+    calls = [node for node in ast.walk(tree_of(file)) if isinstance(node, ast.Call) and changes_files(node)]
+    allowed = WRITES.get(name_of(file), 0)
+    assert isinstance(allowed, str) or len(calls) == allowed, [f"{call.lineno}: {ast.unparse(call)}" for call in calls]
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("path.write_text('x')", True), ("part.write_text('x')", False), ("(part / 'a').write_text('x')", False),
+        ("path.open('wb')", True), ("open(path, mode='a')", True), ("path.open('rb')", False), ("path.open()", False),
+        ("np.save(path, x)", True), ("np.save(part, x)", False), ("image.save(path, 'PNG')", True),
+        ("image.save(buffer, 'PNG')", False), ("result.save(folder)", False), ("a.replace(b)", True),
+        ("text.replace('a', 'b')", False), ("replace(value, name=1)", False), ("os.unlink(path)", True),
+    ],
+)  # fmt: skip
+def test_the_rule_about_writers_finds_them(text, found):
+    call = ast.parse(text).body[0].value
+    assert changes_files(call) == found

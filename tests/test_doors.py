@@ -2,6 +2,7 @@
 
 import errno
 import os
+import pickle
 import subprocess
 import sys
 import zipfile
@@ -15,8 +16,10 @@ import torch
 from safetensors.torch import save_file
 
 from freegeo import files, host
+from freegeo.cameras.plain import read as read_cameras
 from freegeo.cli.app import checked_config, main, out_of_memory
 from freegeo.cli.demo import read_scores
+from freegeo.data.image_files import UnreadableImageError
 from freegeo.errors import DamagedError, FreeGeoError, UserError
 from freegeo.metrics.scene import PRINTED
 from freegeo.models import catalog
@@ -194,9 +197,11 @@ def test_a_plugin_that_does_not_load_hides_no_other_model(monkeypatch, capsys):
     ("error", "what"),
     [
         (MemoryError(), "of this machine"), (torch.OutOfMemoryError("CUDA out of memory. Tried"), "of the device"),
+        (RuntimeError("MPS backend out of memory (MPS allocated: 9 GB)"), "of the device"),
+        (RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"), "of the device"),
         (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried"), "of this machine"),
     ],
-    ids=["python", "device", "torch"],
+    ids=["python", "device", "mps", "cublas", "torch"],
 )  # fmt: skip
 def test_exhausted_memory_says_what_to_change(monkeypatch, capsys, error, what):
     def fail(name):
@@ -230,3 +235,26 @@ def test_the_code_of_a_mistake_is_kept_where_nothing_can_be_printed():
     with FULL.open("w") as full:
         done = subprocess.run([sys.executable, "-m", "freegeo.cli.app", "run"], stderr=full, check=False)
     assert done.returncode == 2
+
+
+@pytest.mark.parametrize("kind", [FreeGeoError, UserError])
+def test_a_sentence_keeps_the_names_of_files_and_cuts_off_their_content(kind):
+    path = "/".join(["x" * 255] * 8)
+    assert str(kind(f"{path}: no such file.")) == f"{path}: no such file."
+    assert str(kind(f"a.json: '{'1' * 5000}' is no number.")) == f"a.json: '{'1' * 79}... is no number."
+
+
+@pytest.mark.parametrize(
+    "error", [UserError("a"), DamagedError("a.json", "b", "c"), UnreadableImageError(Path("a.png"), "b")], ids=repr
+)
+def test_an_error_passes_from_a_worker_to_another_process(error):
+    copy = pickle.loads(pickle.dumps(error))
+    assert (type(copy), str(copy), vars(copy)) == (type(error), str(error), vars(error))
+
+
+@pytest.mark.parametrize("value", [10**299, "1" * 5000, ["x"] * 5000], ids=["number", "text", "list"])
+def test_a_camera_file_is_not_quoted_at_length(tmp_path, value):
+    files.write_json(tmp_path / "cameras.json", {"frames": [{}], "metric": value})
+    with pytest.raises(UserError, match="metric is ") as error:
+        read_cameras(tmp_path / "cameras.json")
+    assert len(str(error.value)) < 300 + len(str(tmp_path))

@@ -1,5 +1,7 @@
 """Files appear whole or not at all, under names and rights as promised."""
 
+import errno
+import fcntl
 import os
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import LEDGER_FILE, atomic_folder, atomic_path, inside, keep_ledger, ledger, remove_written
 from freegeo.lock import LOCK_FILE, locked
+from test_lock import child
 
 
 def names_in(folder: Path) -> set[str]:
@@ -329,3 +332,54 @@ def test_a_process_that_is_killed_while_it_writes_tensors_leaves_nothing_that_is
     assert left
     assert set(left) <= set(files.ledger(tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == [files.LEDGER_FILE]
+
+
+def test_half_written_files_in_a_shared_folder_go_when_nobody_else_writes_there(tmp_path):
+    writer = child(f"""
+from freegeo.files import atomic_path, shared_folder
+folder = Path({str(tmp_path)!r})
+with shared_folder(folder), atomic_path(folder / "1.npz") as part:
+    part.write_text("half")
+    print("READY", flush=True)
+    time.sleep(60)
+""")
+    (tmp_path / "mine.part").write_text("")
+    try:
+        with files.shared_folder(tmp_path):
+            files.write_json(tmp_path / "2.json", 1)
+        assert len(names_in(tmp_path)) == 3
+    finally:
+        writer.kill()
+        writer.wait()
+    with files.shared_folder(tmp_path):
+        assert names_in(tmp_path) == {"mine.part", "2.json"}
+
+
+def test_a_shared_folder_that_cannot_be_locked_is_written_to(tmp_path, monkeypatch):
+    def refuse(*arguments):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with files.shared_folder(tmp_path / "new"):
+        files.write_json(tmp_path / "new" / "2.json", 1)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="file"), files.shared_folder(tmp_path / "file"):
+        files.write_json(tmp_path / "file" / "2.json", 1)
+
+
+def test_way_is_made_for_a_file_that_freegeo_wrote_and_for_no_other(tmp_path):
+    keep_ledger(tmp_path)
+    outside = tmp_path / "outside"
+    for name in ("new.log", "own.log"):
+        files.make_way(tmp_path / name)
+        assert not (tmp_path / name).exists()
+    (tmp_path / "own.log").write_text("first")
+    files.make_way(tmp_path / "own.log")
+    assert not (tmp_path / "own.log").exists()
+    (tmp_path / "mine.log").write_text("mine")
+    (tmp_path / "link.log").symlink_to(outside)
+    for name in ("mine.log", "link.log"):
+        with pytest.raises(UserError, match="freegeo did not"):
+            files.make_way(tmp_path / name)
+    assert (tmp_path / "mine.log").read_text() == "mine" and not outside.exists()
+    assert {"new.log", "own.log"} <= set(ledger(tmp_path))

@@ -14,7 +14,7 @@ from freegeo import files
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import LEDGER_FILE, RUN_FILE, atomic_path, write_json
 from freegeo.lock import LOCK_FILE, locked
-from freegeo.run_folder import Part, check_folder, difference, run_folder
+from freegeo.run_folder import Part, check_folder, difference, run_folder, stored_state
 from test_lock import child
 
 SETTINGS = {"model": "tiny", "recipe": {"steps": 2, "keep": (0, 2)}, "seed": 1}
@@ -241,8 +241,11 @@ def test_removal_that_is_cut_short_does_not_pass_for_a_finished_result(tmp_path,
         patch.setattr(Path, "unlink", unlink_and_stop)
         with pytest.raises(KeyboardInterrupt), run_folder(tmp_path, {}, overwrite=True):
             pass
+    assert (stored_state(tmp_path) or {})["clearing"]
     with run_folder(tmp_path, SETTINGS) as run:
         assert not run.finished
+    with run_folder(tmp_path, {}, overwrite=True):
+        assert "clearing" not in (stored_state(tmp_path) or {})
 
 
 def test_refused_block_leaves_no_trace(tmp_path):

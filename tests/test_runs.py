@@ -3,6 +3,7 @@
 import io
 import logging
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,10 +18,12 @@ from freegeo.adaptation import memory as adaptation_memory
 from freegeo.adaptation import recipe as recipes
 from freegeo.adaptation.adapter import is_adapted
 from freegeo.adaptation.adapter_files import load_adapter, save_adapter
-from freegeo.errors import UserError
+from freegeo.data.photos import load_photos
+from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import atomic_path, write_json
 from freegeo.models import memory as models_memory
 from freegeo.models.checkpoints import fingerprint_of
+from freegeo.models.precision import CPU
 from freegeo.run_folder import run_folder
 from tiny_models import attach, noise, quick, same, tiny_da3, tiny_nested, tiny_vggt
 
@@ -103,6 +106,33 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
 
 
+def test_memory_for_adapting_is_asked_for_where_an_adapter_has_to_be_trained(monkeypatch, tmp_path):
+    """Not where only what comes after it changes: the adapter stays."""
+    found = runs.Inputs(
+        photos=[], batch=tiny_da3().preprocess(load_photos(pictures())), chunks=None, known=None, priors=None,
+        masks=None, scale=None, one_camera=False,
+    )  # fmt: skip
+    asked = []
+    monkeypatch.setattr(runs, "require_adaptation_fits", lambda *given, **named: asked.append(given[1]))
+    monkeypatch.setattr(runs.Job, "run", lambda job: {})
+
+    def asks(filters, overwrite, seed=1):
+        asked.clear()
+        runs.run_in_folder(
+            tmp_path / "out", {"adaptation": {"seed": seed}, "filters": filters}, found, tiny_da3(),
+            overwrite=overwrite, trusted=True, recipe=recipes.named("scene", tiny_da3().spec), compute=CPU,
+            checkpoint=dict, load=tiny_da3, spec=tiny_da3().spec,
+        )  # fmt: skip
+        return asked == [FRAMES]
+
+    assert asks("a", overwrite=False)
+    assert not asks("b", overwrite=False)
+    assert not asks("c", overwrite=True)
+    # Nothing differs, so all of it is made anew.
+    assert asks("c", overwrite=True)
+    assert asks("c", overwrite=True, seed=2)
+
+
 @pytest.mark.parametrize(
     "read", ["own adapter", "own photos", "adapter of another model", "adapter of nobody knows what", "too much memory"]
 )
@@ -166,7 +196,12 @@ def test_a_finished_folder_needs_no_look_at_the_weights(tmp_path):
     def read() -> None:
         raise AssertionError("the weight file was read")
 
-    summary, finished_at = runs.run_in_folder(
-        tmp_path / "out", {}, found, overwrite=False, trusted=False, checkpoint=read
-    )  # ty: ignore[invalid-argument-type]
+    run = partial(
+        runs.run_in_folder, tmp_path / "out", {}, found, tiny_da3(), overwrite=False, trusted=False, recipe=None,
+        compute=CPU, checkpoint=read,
+    )  # fmt: skip
+    summary, finished_at = run()
     assert finished_at and summary == {"images": []}
+    (tmp_path / "out" / "reconstruction.json").unlink()
+    with pytest.raises(FreeGeoError, match=r"was removed after the run was finished\. Run again with --overwrite\."):
+        run()

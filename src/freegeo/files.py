@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from freegeo.errors import DamagedError, FreeGeoError, UserError
 from freegeo.host import gigabytes, host_available
-from freegeo.lock import LOCK_FILE, Lock, note_removed, note_written, require_lock, require_no_link
+from freegeo.lock import LOCK_FILE, Lock, hold_shared, note_removed, note_written, require_lock, require_no_link
 
 if TYPE_CHECKING:
     import numpy as np
@@ -190,6 +190,19 @@ def remove_file(path: Path) -> None:
     note_removed(path)
 
 
+def make_way(path: Path) -> None:
+    """Remove a file that freegeo wrote before another process begins to write it, line by line, under its final name.
+
+    UserError when somebody else put a file or a link there; other errors as `remove_file`.
+    """
+    _require_own(path, path.parent)
+    if path.is_symlink() and not path.exists():
+        raise UserError(f"{path}: is a symbolic link, and freegeo did not make it. Remove it.")
+    _require_not_foreign([path])
+    _enter_in_ledger([path])
+    remove_file(path)
+
+
 def _flush(path: Path) -> None:
     with path.open("rb+") as file:
         os.fsync(file.fileno())
@@ -315,6 +328,16 @@ def remove_listed(owner: Path, names: Iterable[str]) -> None:
 def remove_parts(owner: Path) -> None:
     """Remove the half-written files and folders of a process that was killed."""
     remove_listed(owner, [name for name in ledger(owner) if is_part(Path(name))])
+
+
+@contextmanager
+def shared_folder(folder: Path) -> Generator[None]:
+    """Write into a folder without a ledger to which other processes write too, each its own files.
+
+    What killed processes left half-written there is removed first, when no other process is in such a block.
+    """
+    with hold_shared(folder, when_alone=lambda: [_remove(path) for path in folder.iterdir() if is_part(path)]):
+        yield
 
 
 def is_part(path: Path) -> bool:

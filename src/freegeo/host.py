@@ -10,7 +10,7 @@ import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 PARENT_VARIABLE = "FREEGEO_END_WITH_PARENT"
@@ -38,6 +38,18 @@ def gigabytes(count: float) -> str:
 def host_available() -> int:
     """Bytes of main memory that are free or can be freed, within the limits of containers and batch systems."""
     return max(0, min([_of_machine(), *_of_groups()]))
+
+
+def exhausted_memory(error: BaseException) -> Literal["device", "machine"] | None:
+    """Say whose memory an error of PyTorch or Python found exhausted; None for other errors."""
+    text = str(error)
+    of_torch = type(error).__name__ in ("OutOfMemoryError", "AcceleratorError") and "out of memory" in text
+    # The libraries of CUDA (cuBLAS, cuDNN) and the allocator of main memory raise a plain RuntimeError.
+    if of_torch or "MPS backend out of memory" in text or "_STATUS_ALLOC_FAILED" in text:
+        return "device"
+    if isinstance(error, MemoryError) or "can't allocate memory" in text or "not enough memory" in text:
+        return "machine"
+    return None
 
 
 def _of_machine() -> int:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Generator
-from contextlib import contextmanager
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -94,6 +94,27 @@ def kept_still(folder: Path | None) -> Generator[None]:
         yield
         return
     with locked(folder):
+        yield
+
+
+@contextmanager
+def hold_shared(folder: Path, *, when_alone: Callable[[], object]) -> Generator[None]:
+    """Hold a folder together with other processes; the first to come calls `when_alone` before others can hold it.
+
+    The folder itself is locked, so that no file is made. It is not where the system cannot do that, and `when_alone` is
+    not called there. A folder that cannot be made is left to who writes into it.
+    """
+    with ExitStack() as stack:
+        with suppress(OSError, ImportError):
+            import fcntl
+
+            folder.mkdir(parents=True, exist_ok=True)
+            handle = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, handle)
+            with suppress(BlockingIOError):
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                when_alone()
+            fcntl.flock(handle, fcntl.LOCK_SH)
         yield
 
 

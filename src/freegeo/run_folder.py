@@ -45,6 +45,8 @@ class _State(TypedDict, total=False):
     settings: Required[dict[str, Any]]
     finished: Required[str | None]
     notes: dict[str, Any] | None
+    clearing: bool
+    """Its files are being removed for a run with `overwrite`; a state that is written after that does not say so."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,7 @@ def _open(lock: Lock, settings: Mapping[str, Any], overwrite: bool, parts: Seque
         same = before["settings"] == settings
         if same and not overwrite:
             return RunFolder(path, lock, settings, before["finished"], before.get("notes") or {})
-        kept = [] if same else parts[: _unchanged(before["settings"], settings, parts)]
+        kept = kept_parts(before["settings"], settings, parts)
         _require_free(path, [part for part in parts if part not in kept])
         clear(path, keep=lambda name: any(part.owns(name) for part in kept))
         notes = {part.name: before["notes"][part.name] for part in kept if part.name in (before.get("notes") or {})}
@@ -193,6 +195,12 @@ def _require_free(path: Path, parts: Sequence[Part]) -> None:
         strangers = sorted(f for f in there if f.is_file() and f.parent.resolve() / f.name not in own)
         if strangers:
             raise UserError(f"{strangers[0]}: freegeo did not write it, and it is in the way. Move or remove it.")
+
+
+def kept_parts(before: Mapping[str, Any], settings: Mapping[str, Any], parts: Sequence[Part]) -> Sequence[Part]:
+    """Return the parts whose files stay when a run with JSON-like settings replaces the one of before."""
+    now = as_json(settings)
+    return () if before == now else parts[: _unchanged(before, now, parts)]
 
 
 def _unchanged(before: Mapping[str, Any], now: Mapping[str, Any], parts: Sequence[Part]) -> int:
@@ -258,7 +266,7 @@ def clear(path: Path, *, keep: Callable[[str], bool] = lambda name: False) -> No
     state = stored_state(path)
     if state is not None:
         # If the removal is interrupted, the remaining files must not count as a finished result.
-        write_json(path / RUN_FILE, {**state, "finished": None})
+        write_json(path / RUN_FILE, {**state, "finished": None, "clearing": True})
     names = ledger(path)
     kept = [name for name in names if keep(name) and not is_part(Path(name))]
     remove_listed(path, set(names) - set(kept))

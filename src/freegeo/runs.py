@@ -23,13 +23,13 @@ from freegeo.adaptation.recipe import SMALLEST_SCENE, Guard, Recipe, require_unc
 from freegeo.cameras.undistortion import UndistortedPhoto
 from freegeo.data.photos import doubt_blank, some_of
 from freegeo.data.video import VideoFrame
-from freegeo.errors import UserError
+from freegeo.errors import FreeGeoError, UserError
 from freegeo.export.base import DepthSize
 from freegeo.export.photos import FOLDER as COPIES_FOLDER
 from freegeo.export.photos import write_copies
 from freegeo.files import ledger, read_json
 from freegeo.host import gigabytes
-from freegeo.job import MATCHES_NAME, PARTS, SUMMARY_NAME, Job
+from freegeo.job import ADAPTATION, MATCHES_NAME, PARTS, SUMMARY_NAME, Job
 from freegeo.metres import read_scale, require_in_view
 from freegeo.models.checkpoints import fingerprint
 from freegeo.models.images import look_at_photos, read_photos, read_some
@@ -38,7 +38,7 @@ from freegeo.models.precision import Compute
 from freegeo.models.spec import MIXED, Mixed, ModelSpec, PoseFrom
 from freegeo.pipeline import require_reference
 from freegeo.posed import check_known, digest, is_one_camera, told, told_in_chunks
-from freegeo.run_folder import check_folder, run_folder, stored_state
+from freegeo.run_folder import check_folder, kept_parts, run_folder, stored_state
 from freegeo.sequence.chunks import OVERLAP, OrderRule, plan_chunks
 from freegeo.sequence_job import SEQUENCE_PARTS, Plan, SequenceJob
 
@@ -227,10 +227,6 @@ def read_inputs(
     require_reference(reference, priors)
     if recipe is not None and priors is not None:
         require_unchanged_images(recipe)
-    if recipe is not None and before is None:
-        # Before a result that is there gives way. An adapter that is trained already needs no memory.
-        together = len(batch) if chunks is None else min(chunks.size, len(batch))
-        require_adaptation_fits(model, together, batch.image_hw, recipe, compute=compute)
     source = None if scale is None else read_scale(scale, photos)
     if source is not None:
         require_in_view(source, batch, photos)
@@ -440,9 +436,12 @@ def run_in_folder(
     output: Path,
     settings: Mapping[str, Any],
     found: Inputs,
+    model: ReconstructionModel,
     *,
     overwrite: bool,
     trusted: bool,
+    recipe: Recipe | None,
+    compute: Compute,
     checkpoint: Callable[[], Mapping[str, Any] | None],
     **job: Any,
 ) -> tuple[dict[str, Any], str | None]:
@@ -452,8 +451,11 @@ def run_in_folder(
         output: the folder.
         settings: from `settings_of`.
         found: the photos.
+        model: decides how much memory adapting takes; its weights have no part in that.
         overwrite: replace what an earlier run with other settings wrote.
         trusted: known poses are not checked by matches.
+        recipe: of the adaptation; None: there is none.
+        compute: where the model runs.
         checkpoint: gives what a `Job` takes as checkpoint; called where the folder is not finished, since it may read
             the whole weight file.
         **job: what else a `Job` takes.
@@ -462,15 +464,23 @@ def run_in_folder(
         The content of reconstruction.json, and when the folder was finished before; None: just now.
     """
     unchecked = None if trusted else found.known
-    state = stored_state(output)
+    state, parts = stored_state(output), PARTS if found.chunks is None else SEQUENCE_PARTS
+    # An adapter that stays needs no memory, and a run that continues looks at it again.
+    stays = state is not None and (not overwrite or ADAPTATION in kept_parts(state["settings"], settings, parts))
+    if recipe is not None and not stays:
+        # Before a result that is there gives way.
+        together = len(found.batch) if found.chunks is None else min(found.chunks.size, len(found.batch))
+        require_adaptation_fits(model, together, found.batch.image_hw, recipe, compute=compute)
     if unchecked is not None and state is not None and state["settings"].get("placing") != settings["placing"]:
         # Before a result that is there gives way to one with cameras that may be refused.
         _check_cameras(unchecked, found.photos)
         unchecked = None
-    parts = PARTS if found.chunks is None else SEQUENCE_PARTS
     with run_folder(output, settings, overwrite=overwrite, parts=parts, labels=LABELS) as folder:
         if folder.finished:
-            return read_json(folder / SUMMARY_NAME, _Record, advice="Run again with --overwrite."), folder.finished_at
+            summary, advice = folder / SUMMARY_NAME, "Run again with --overwrite."
+            if not summary.is_file():
+                raise FreeGeoError(f"{summary}: was removed after the run was finished. {advice}")
+            return read_json(summary, _Record, advice=advice), folder.finished_at
         if unchecked is not None:
             _check_cameras(unchecked, found.photos, folder / MATCHES_NAME)
         if any(isinstance(photo, VideoFrame | UndistortedPhoto) for photo in found.photos):
@@ -479,7 +489,7 @@ def run_in_folder(
         work = kind(
             folder=folder, photos=found.photos, batch=found.batch, masks=found.masks, known=found.known,
             priors=found.priors, one_camera=found.one_camera, scale=found.scale, checkpoint=checkpoint(),
-            **job,
+            recipe=recipe, compute=compute, **job,
         )  # fmt: skip
         try:
             return work.run(), None

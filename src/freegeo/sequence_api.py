@@ -210,7 +210,7 @@ def reconstruct_sequence(
         )  # fmt: skip
         with step_bar() if progress else nullcontext(lambda step: None) as on_step:
             summary, _ = run_in_folder(
-                folder, settings, found, overwrite=overwrite, trusted=trust_cameras, load=lambda: model,
+                folder, settings, found, model, overwrite=overwrite, trusted=trust_cameras, load=lambda: model,
                 spec=model.spec, recipe=plan, adapter=saved, guard=guard, seed=seed, compute=compute,
                 hooks=Hooks(stage=_said if progress else lambda stage: None, step=on_step), reference=reference,
                 warnings=warned, formats=written, filters=points, refine=refine, pose_from=pose_from,

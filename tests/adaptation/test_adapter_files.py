@@ -253,6 +253,15 @@ def test_a_rank_that_is_not_that_of_the_matrices_is_refused_before_there_is_room
         load_adapter(tiny_da3(), tmp_path)
 
 
+@pytest.mark.parametrize("strength", [math.nan, math.inf, -1e9, 1e300])
+def test_a_strength_that_no_adapter_has_is_refused(tmp_path, strength):
+    model = tiny_da3()
+    save_adapter(trained(model), tmp_path, METADATA)
+    about = json.loads((tmp_path / "freegeo.json").read_text())
+    (tmp_path / "freegeo.json").write_text(json.dumps({**about, "strength": strength}))
+    refused(tiny_da3(), tmp_path, "freegeo.json: the strength is .*, as none is")
+
+
 def test_damaged_files_are_named(tmp_path):
     saved(tiny_da3, tmp_path / "short")
     weights = tmp_path / "short" / "adapter_model.safetensors"

@@ -1,6 +1,7 @@
 import errno
 import json
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -104,6 +105,8 @@ def test_a_failing_item_does_not_stop_the_others_but_a_bug_does():
     done = []
     problems = run_each([1, 2, 3], work, explain)
     assert done == [1, 3]
+    without_memory = RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried")
+    assert len(run_each([0, 1], Mock(side_effect=[without_memory, None]), lambda item, error: problems[0])) == 1
     assert [problem.scene for problem in problems] == ["2"]
     with pytest.raises(TypeError):
         run_each([None], lambda item: item + 1, explain)

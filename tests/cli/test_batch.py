@@ -1,5 +1,6 @@
 """`freegeo batch`: names and refusals, options that reach every scene, what is written, deaths of workers."""
 
+import math
 import os
 import shutil
 import socket
@@ -20,13 +21,13 @@ from cli.conftest import QUICK
 from freegeo import pools
 from freegeo.cli import console
 from freegeo.cli.app import build
-from freegeo.cli.batch import RECORD_NAME, _in_worker, _Table, as_arguments, environments
+from freegeo.cli.batch import RECORD_NAME, _in_worker, _Table, as_arguments, environments, stored_rows
 from freegeo.cli.files import FileOptions, FilterOptions
 from freegeo.cli.options import ModelOptions, PhotoOptions, PlacingOptions, RecipeOptions
 from freegeo.cli.scenes import named_scenes
 from freegeo.errors import UserError
 from freegeo.files import read_json, write_json
-from freegeo.report.overview import SceneRow
+from freegeo.report.overview import SceneRow, write_overview
 from freegeo.run_folder import run_folder
 from processes import kill_one, needs_proc
 
@@ -216,6 +217,13 @@ def test_no_scene_counts_as_done_before_the_page_shows_it(tmp_path, monkeypatch)
     assert (seen, record.exists()) == ([False], True)
 
 
+@pytest.mark.parametrize(("seconds", "shown"), [(math.inf, "inf"), (math.nan, "nan"), (12.4, "12")])
+def test_a_record_with_seconds_that_are_no_number_makes_a_page(tmp_path, seconds, shown):
+    write_json(tmp_path / RECORD_NAME, {"scenes": [{"name": "a", "outcome": "frozen", "seconds": seconds}]})
+    write_overview(tmp_path, "index.html", list(stored_rows(tmp_path / RECORD_NAME).values()))
+    assert f"<td>{shown}</td>" in (tmp_path / "index.html").read_text()
+
+
 def test_places_that_are_taken_are_refused(freegeo, photo_folder, tiny, tmp_path):
     out = tmp_path / "out"
     (out / photo_folder.name).mkdir(parents=True)
@@ -225,6 +233,10 @@ def test_places_that_are_taken_are_refused(freegeo, photo_folder, tiny, tmp_path
     outcome = freegeo("batch", photo_folder, "-o", out, *tiny)
     assert outcome.code == 2 and "did not write" in outcome.sentence()
     assert (out / "index.html").read_text() == ""
+    (out / "index.html").rename(out / f"{photo_folder.name}.log")
+    outcome = freegeo("batch", photo_folder, "-o", out, *tiny)
+    assert outcome.code == 2 and "did not write" in outcome.sentence()
+    assert (out / f"{photo_folder.name}.log").read_text() == ""
     with run_folder(tmp_path / "one", {"command": "run"}) as folder:
         folder.finish()
     assert "another command" in freegeo("batch", photo_folder, "-o", tmp_path / "one", *tiny).sentence()
@@ -236,10 +248,11 @@ def test_places_that_are_taken_are_refused(freegeo, photo_folder, tiny, tmp_path
 class HerePool:
     """Works in this process, as a worker of ray does; the first start of a scene in `dies` is its worker's death.
 
-    It dies before it has looked at the folder of the scene, or, with `dies_late`, when it has begun to replace it.
+    It dies before it has looked at the folder of the scene, or, by `dies_when`, when it has begun a new run there
+    (``begun``) or while it removes what was made with other options (``clearing``).
     """
 
-    dies_late = False
+    dies_when = ""
 
     def __init__(self, out, dies=()):
         self.work, self.dies, self.running, self.commands = partial(_in_worker, out), set(dies), [], []
@@ -259,8 +272,9 @@ class HerePool:
             return []
         item, again = self.running.pop(0)
         if str(item) in self.dies and not again:
-            if self.dies_late and item.state.is_file():
-                write_json(item.state, {**read_json(item.state), "finished": None})
+            if self.dies_when and item.state.is_file():
+                left = {"settings": {"made": "otherwise"}, "clearing": True} if self.dies_when == "clearing" else {}
+                write_json(item.state, {**read_json(item.state), "finished": None, **left})
             return [(item, pools.Died("SIGKILL"))]
         code = self.work(item, again)
         # Messages went to the log, which is closed; another process would have handlers of its own.
@@ -331,8 +345,8 @@ def test_scenes_fail_on_their_own_and_the_same_command_continues(freegeo, here, 
 
 def test_a_retry_overwrites_what_is_old_and_not_what_it_continues(freegeo, here, rooms, tiny, tmp_path, monkeypatch):
     command = ["batch", rooms / "room-0", "-o", tmp_path / "out", *tiny, *FROZEN, "--overwrite"]
-    for late, overwrites in ((False, True), (True, False)):
-        monkeypatch.setattr(HerePool, "dies_late", late)
+    for when, overwrites in (("", True), ("begun", False), ("clearing", True)):
+        monkeypatch.setattr(HerePool, "dies_when", when)
         assert freegeo(*command).code == 0
         assert ["--overwrite" in arguments for arguments in here[-1].commands] == [True, overwrites]
 

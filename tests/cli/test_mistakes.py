@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from cli.conftest import QUICK
 from freegeo.adaptation import adapt as adapting
+from freegeo.cli.options import ModelOptions
 from png_header import png_header
 
 
@@ -187,7 +188,9 @@ def test_default_model_offline_names_the_ways_out(freegeo, photo_folder, tmp_pat
 
 @pytest.mark.parametrize("command", ["run", "adapt", "reconstruct"])
 @pytest.mark.parametrize("place", ["file", "file/below", "full"])
-def test_output_that_cannot_be_written_to(freegeo, photo_folder, tiny, tmp_path, command, place):
+def test_output_that_cannot_be_written_to(freegeo, photo_folder, tiny, tmp_path, monkeypatch, command, place):
+    """It is refused before the weights are loaded."""
+    monkeypatch.setattr(ModelOptions, "load", lambda options: pytest.fail("the weights were loaded"))
     (tmp_path / "file").write_text("mine")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")

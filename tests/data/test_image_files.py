@@ -346,3 +346,18 @@ def test_an_image_that_announces_too_many_pixels_is_refused_before_there_is_room
     finally:
         resource.setrlimit(resource.RLIMIT_AS, before)
     assert "more than the limit of 150 megapixels" in str(refused.value)
+
+
+@pytest.mark.parametrize("door", [lambda path: load_photos([path]), read_gray], ids=["photo", "map"])
+def test_a_jpeg_that_is_too_small_for_its_pixels_is_refused_before_there_is_room_for_them(tmp_path, door):
+    """Its decoder would make grey of what is missing, 432 MB of it."""
+    (tmp_path / "a.jpg").write_bytes(announced("JPEG", 12_000))
+    with pytest.raises(UserError, match=r"damaged or truncated \(\d+ bytes are too few for a JPEG of 12000 x 12000"):
+        door(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("mode", ["RGB", "L"])
+def test_a_plain_jpeg_is_not_too_small_for_its_pixels(tmp_path, mode):
+    Image.new(mode, (2048, 2048)).save(tmp_path / "a.jpg", quality=5, optimize=True)
+    (photo,) = load_photos([tmp_path / "a.jpg"])
+    assert photo.size_hw == (2048, 2048)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from bench_tools import small_room
 from freegeo.data.procedural import (
     DOMAINS,
     Domain,
@@ -19,6 +20,7 @@ from freegeo.data.procedural import (
     render,
     resized_intrinsics,
     sample_rooms,
+    splits,
 )
 from freegeo.data.procedural.raytrace import RenderedViews
 from freegeo.data.procedural.rooms import CLEARANCE_M, FIRST_CYLINDER, FIRST_SPHERE
@@ -372,3 +374,13 @@ def test_photographs(aspect, hw):
 def test_mistakes_are_explained(wrong):
     with pytest.raises(UserError):
         wrong()
+
+
+def test_half_written_rooms_of_a_killed_process_are_removed_by_the_next_that_renders_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(splits, "photograph_room", small_room)
+    left = [tmp_path / f".20000001.0123abcd.part.{suffix}" for suffix in ("npz", "ply")]
+    for file in left:
+        file.write_bytes(b"half")
+    scene = splits.load_room("test-id", tmp_path, "20000003")
+    assert len(scene.photos) == splits.FRAMES
+    assert {file.name for file in tmp_path.iterdir()} == {"20000003.npz", "20000003.ply"}

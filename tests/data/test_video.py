@@ -1,5 +1,6 @@
 """Videos are small ones made here: a window that slides over a large random picture."""
 
+from contextlib import contextmanager
 from fractions import Fraction
 
 import av
@@ -8,7 +9,7 @@ import pytest
 from PIL import Image
 
 from freegeo.data import video
-from freegeo.data.video import Candidate, VideoFrame, choose_by_parallax, load_video
+from freegeo.data.video import Candidate, VideoFrame, choose_by_parallax, collect_candidates, load_video
 from freegeo.errors import FreeGeoError, UserError
 
 HEIGHT, WIDTH = 48, 64
@@ -308,3 +309,55 @@ def test_names_of_videos_are_known():
     assert not video.is_video("photo.jpg")
     assert not video.is_video("photo.gif")
     assert VideoFrame.__dataclass_params__.frozen
+
+
+def test_a_video_above_the_pixel_limit_is_refused_by_its_header(tmp_path, monkeypatch):
+    path = write_video(tmp_path / "a.mkv", [window(4 * k) for k in range(4)])
+    monkeypatch.setattr(video, "MAX_PIXELS", WIDTH * HEIGHT)
+    assert load_video(path, max_views=1)
+    monkeypatch.setattr(video, "MAX_PIXELS", WIDTH * HEIGHT - 1)
+    with pytest.raises(UserError, match=r"a\.mkv: frames of 64 x 48 pixels are more than the limit"):
+        load_video(path, max_views=1)
+
+
+def test_frames_that_are_larger_than_the_header_says_are_not_decoded(tmp_path, monkeypatch, caplog):
+    """They come later than FFmpeg looks when it opens a file."""
+    for name, image, start, count in (("small", window(0), 0, 40), ("large", picture()[:320, :320], 20_000, 4)):
+        times = [start + 400 * k for k in range(count)]
+        write_video(tmp_path / f"{name}.ts", [image] * count, times=times, codec="libx264", gop=1)
+    both = tmp_path / "both.ts"
+    both.write_bytes((tmp_path / "small.ts").read_bytes() + (tmp_path / "large.ts").read_bytes())
+    sizes = {candidate.size_hw for candidate in collect_candidates(both, slot_s=0.01)}
+    assert sizes == {(HEIGHT, WIDTH), (320, 320)}
+    monkeypatch.setattr(video, "MAX_PIXELS", WIDTH * HEIGHT)
+    assert {candidate.size_hw for candidate in collect_candidates(both, slot_s=0.01)} == {(HEIGHT, WIDTH)}
+    assert "damaged frames are left out" in caplog.text
+
+
+class Unseekable:
+    """A container in which nothing can be sought."""
+
+    def __init__(self, container, error):
+        self.container, self.error = container, error
+
+    def __getattr__(self, name):
+        return getattr(self.container, name)
+
+    def seek(self, *arguments, **options):
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(1, "not permitted"), av.error.ArgumentError(22, "invalid"), ValueError("x")], ids=repr
+)
+def test_a_file_that_cannot_be_sought_in_is_decoded_from_its_start(tmp_path, monkeypatch, error):
+    frames = load_video(write_video(tmp_path / "a.mkv", [window(4 * k) for k in range(20)]), max_views=3)
+    expected, opened = [frame.read() for frame in frames], video._opened
+
+    @contextmanager
+    def unseekable(path):
+        with opened(path) as container:
+            yield Unseekable(container, error)
+
+    monkeypatch.setattr(video, "_opened", unseekable)
+    assert all(np.array_equal(frame.read(), pixels) for frame, pixels in zip(frames, expected, strict=True))

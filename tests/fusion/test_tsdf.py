@@ -3,7 +3,7 @@ import pytest
 import torch
 from PIL import Image
 
-from freegeo.errors import UserError
+from freegeo.errors import DamagedError, FreeGeoError, UserError
 from freegeo.export.mesh import load_mesh
 from freegeo.fusion.marching import extract_surface
 from freegeo.fusion.mesh import Mesh, empty_mesh_substitute, read_mesh, sample_surface
@@ -158,4 +158,36 @@ def test_a_mesh_opens_no_picture_that_it_names(tmp_path, monkeypatch, name, capf
 def test_other_kinds_of_meshes_are_refused(tmp_path, name):
     (tmp_path / name).write_bytes(b"x")
     with pytest.raises(UserError, match="a mesh is read from ply, obj, stl, off"):
+        read_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "error", [UnboundLocalError("x"), KeyError("x"), AttributeError("x"), IndexError("x")], ids=repr
+)
+def test_what_the_reader_of_meshes_raises_for_a_damaged_file_is_one_sentence(tmp_path, monkeypatch, error):
+    def fail(*arguments, **options):
+        raise error
+
+    (tmp_path / "m.ply").write_text(MATERIALS["m.ply"])
+    monkeypatch.setattr("trimesh.load", fail)
+    with pytest.raises(
+        DamagedError, match=rf"m\.ply: damaged file \({type(error).__name__}: .*Copy or export it again"
+    ):
+        read_mesh(tmp_path / "m.ply")
+
+
+def test_memory_that_is_exhausted_by_a_mesh_is_no_damage(tmp_path, monkeypatch):
+    def fail(*arguments, **options):
+        raise MemoryError
+
+    (tmp_path / "m.ply").write_text(MATERIALS["m.ply"])
+    monkeypatch.setattr("trimesh.load", fail)
+    with pytest.raises(MemoryError):
+        read_mesh(tmp_path / "m.ply")
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_a_damaged_mesh_is_named(tmp_path, name):
+    (tmp_path / name).write_text(MATERIALS[name].replace("3 0 1 2", "3 0 1").replace("f 1/1 2/2 3/3", "f 1/1 2/2 9/x"))
+    with pytest.raises(FreeGeoError, match=name):
         read_mesh(tmp_path / name)

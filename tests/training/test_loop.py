@@ -16,7 +16,7 @@ from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import read_json
 from freegeo.models.catalog import load_model
 from freegeo.training import loop, state
-from freegeo.training.loop import train
+from freegeo.training.loop import LOG, train
 
 pytestmark = pytest.mark.slow
 
@@ -156,6 +156,15 @@ def test_a_state_of_an_earlier_version_is_refused(tmp_path, small_config):
     with pytest.raises(UserError, match=r"restart.pt: an earlier version of freegeo wrote this state"):
         train(small_config, tmp_path / "next", continue_from=tmp_path)
     assert not (tmp_path / "next" / state.START_FILE).exists()
+
+
+def test_a_log_that_is_a_link_is_not_followed(tmp_path, small_config):
+    out, outside = tmp_path / "out", tmp_path / "outside"
+    out.mkdir()
+    (out / LOG).symlink_to(outside)
+    with pytest.raises(UserError, match=r"log\.jsonl: is a symbolic link"):
+        train(small_config, out, minutes=0)
+    assert not outside.exists()
 
 
 def test_other_settings_need_another_folder(small_config, whole_run):

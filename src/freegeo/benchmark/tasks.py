@@ -25,6 +25,7 @@ import torch
 from freegeo.benchmark import sampling
 from freegeo.errors import FreeGeoError, LostFolderError, UserError
 from freegeo.files import as_json, read_json, remove_file, write_json
+from freegeo.host import exhausted_memory
 from freegeo.models.spec import AdaptationDefaults
 from freegeo.run_folder import difference
 
@@ -208,7 +209,9 @@ def run_each(
             problems += work(item) or ()
         except LostFolderError:
             raise
-        except DAMAGED as error:
+        except Exception as error:
+            if not isinstance(error, DAMAGED) and exhausted_memory(error) is None:
+                raise
             logger.debug("failed on %s", item, exc_info=True)
             problems.append(explain(item, error))
         on_done(item)

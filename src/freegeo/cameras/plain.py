@@ -32,7 +32,7 @@ def read(path: Path) -> CameraFile:
     content, frames = read_frames(path)
     metric = content.get("metric", False)
     if not isinstance(metric, bool):
-        raise UserError(f"{path}: metric is {metric!r}; it must be true or false.")
+        raise UserError(f"{path}: metric is {metric!r:.40}; it must be true or false.")
     return CameraFile(source=str(path), cameras=[_frame(frame, path) for frame in frames], metric=metric, upright=True)
 
 

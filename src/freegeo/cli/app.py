@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 from freegeo import __version__
 from freegeo.cli import console
 from freegeo.errors import FreeGeoError, PartialResultError, UserError
-from freegeo.host import end_with_parent
+from freegeo.host import end_with_parent, exhausted_memory
 
 if TYPE_CHECKING:
     from cyclopts import App
@@ -154,16 +154,13 @@ def run_command(arguments: Sequence[str]) -> int:
 
 def out_of_memory(error: BaseException) -> str | None:
     """Return what to do about an error of exhausted memory, of this machine or of a device; None for other errors."""
-    text = " ".join(str(error).split())
-    again = "The same command continues an unfinished run."
-    of_device = type(error).__name__ in ("OutOfMemoryError", "AcceleratorError") and "out of memory" in text
-    if of_device or "MPS backend out of memory" in text:
+    of, again = exhausted_memory(error), "The same command continues an unfinished run."
+    if of == "device":
         return (
             "the memory of the device does not suffice. Use fewer photos (--max-views, --views), smaller images "
             f"(--process-res), --precision bf16 or a smaller --model, or free the device of other work. {again}"
         )
-    # PyTorch's allocator of main memory raises a plain RuntimeError.
-    if isinstance(error, MemoryError) or "can't allocate memory" in text or "not enough memory" in text:
+    if of == "machine":
         return (
             "the memory of this machine does not suffice. Use fewer photos (--max-views), smaller images "
             f"(--process-res) or a smaller --model, or close other programs. {again}"

@@ -35,7 +35,7 @@ from freegeo.cli.options import (
 )
 from freegeo.cli.scenes import INDEX_NAME, LOG, RECORD_NAME, NamedScene, is_video_scene, look_at, named_scenes
 from freegeo.errors import FreeGeoError, PartialResultError, UserError
-from freegeo.files import RUN_FILE, read_json, write_json
+from freegeo.files import RUN_FILE, make_way, read_json, write_json
 from freegeo.models.spec import PoseFrom
 from freegeo.run_folder import check_folder, run_folder, stored_state
 
@@ -70,9 +70,10 @@ class _Work:
     def command(self, *, again: bool) -> list[str]:
         """Return the arguments of `freegeo`.
 
-        After a death --overwrite is left out where the dead process had begun to overwrite, so that it is continued.
+        After a death --overwrite is left out where the dead process had removed what was there, so that it continues.
         """
-        begun = again and _written(self.state) != self.before
+        state = stored_state(self.state.parent) if again and _written(self.state) != self.before else None
+        begun = state is not None and not state.get("clearing")
         return [*self.arguments, *(["--overwrite"] if self.overwrite and not begun else [])]
 
     def __str__(self) -> str:
@@ -269,7 +270,7 @@ class _Table:
             return
         with self._pool(device, jobs=jobs, cluster=cluster) as pool:
             for work in self.waiting:
-                work.log.unlink(missing_ok=True)
+                make_way(work.log)
             self.write()
             started = time.monotonic()
             for work, outcome in outcomes(pool, self.waiting, on_wait=self._say_begun):

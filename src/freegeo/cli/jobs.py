@@ -111,7 +111,7 @@ def run_job(
         require_fitting(empty, adapter, model_options.fingerprint)
     with progress_hooks() as hooks:
         summary, finished_at = run_in_folder(
-            output.output, settings, found, overwrite=output.overwrite, trusted=cameras.trust_cameras,
+            output.output, settings, found, empty, overwrite=output.overwrite, trusted=cameras.trust_cameras,
             load=model_options.load, spec=empty.spec, recipe=plan, seed=model_options.seed, compute=compute,
             hooks=hooks, command=console.command_line(), warnings=console.warned(), after=after,
             filters=files.filters.settings(), checkpoint=model_options.origin, **same,

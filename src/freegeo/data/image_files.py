@@ -34,6 +34,8 @@ _DARK, _BRIGHT, _FLAT = 0.04, 0.97, 0.02
 _HEAD = 30
 """Bytes at the beginning of a file that are looked at; those of a WebP with its size."""
 _HEIF_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
+_JPEGS, _MOST_PIXELS_IN_A_BYTE = ("JPEG", "MPO"), 512
+"""Each block of 8 x 8 pixels takes a bit at least. A decoder makes grey of what is missing, without an error."""
 _ORIENTATION_TAG, _SIDEWAYS = 0x0112, (5, 6, 7, 8)
 _SIXTEEN_BITS, _FLOAT_SLACK = 65_535, 0.01
 _DEEP_MODES = frozenset({"I;16", "I;16B", "I;16L", "I;16N", "I", "F"})
@@ -83,6 +85,9 @@ def opened(path: Path) -> Generator[PillowImage]:
     with image:
         if image.width * image.height > MAX_PIXELS:
             raise _too_large(path, f"{image.width} x {image.height} pixels are")
+        size = path.stat().st_size
+        if image.format in _JPEGS and image.width * image.height > _MOST_PIXELS_IN_A_BYTE * size:
+            raise _damaged(path, f"{size} bytes are too few for a JPEG of {image.width} x {image.height} pixels")
         yield image
 
 
@@ -157,8 +162,9 @@ def _require_no_shortage(error: BaseException) -> None:
         raise error
 
 
-def _damaged(path: Path | str, error: BaseException) -> UnreadableImageError:
-    _require_no_shortage(error)
+def _damaged(path: Path | str, error: BaseException | str) -> UnreadableImageError:
+    if isinstance(error, BaseException):
+        _require_no_shortage(error)
     return UnreadableImageError(path, f"the image is damaged or truncated ({' '.join(str(error).split())})")
 
 
@@ -363,6 +369,15 @@ def _turned(pixels: np.ndarray, orientation: int | None) -> np.ndarray:
         8: lambda a: np.rot90(a, 1),
     }.get(orientation or 1, lambda a: a)
     return np.array(upright(pixels), order="C")
+
+
+def is_cut_off(image: PillowImage, pixels: np.ndarray) -> bool:
+    """Whether the pixels (H, W, 3) of a decoded JPEG end in the very grey that decoders put in the place of lost data.
+
+    They may have been turned since.
+    """
+    edges = (pixels[-1], pixels[0], pixels[:, -1], pixels[:, 0])
+    return image.format in _JPEGS and any((edge == 128).all() for edge in edges)
 
 
 def is_blank(pixels: np.ndarray) -> bool:

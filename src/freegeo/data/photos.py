@@ -23,6 +23,7 @@ from freegeo.data.image_files import (
     deep_values,
     holds_several,
     is_blank,
+    is_cut_off,
     is_image,
     opened,
     orientation,
@@ -419,6 +420,8 @@ class _Look:
     several: bool
     """Whether the file holds further pictures."""
     exif_damaged: bool = False
+    cut_off: bool = False
+    """Whether it ends in plain grey, as a JPEG does whose data are lost."""
     white: float | None = None
     """Value that is white, of a file with more than 8 bits a channel."""
     largest: int | None = None
@@ -445,6 +448,11 @@ def _looked_at(files: Sequence[Path], count: int, *, skip_bad: bool) -> dict[Pat
             "damaged EXIF data do not say how these photos are turned: %s. Look whether they are upright.",
             some_of(damaged),
         )
+    if cut_off := [file.name for file, look in looks.items() if look.cut_off]:
+        logger.warning(
+            "these photos end in plain grey, as a JPEG does that was cut off: %s. Look whether they are whole.",
+            some_of(cut_off),
+        )
     return _with_common_white(looks)
 
 
@@ -460,7 +468,10 @@ def _look(file: Path) -> _Look | UnreadableImageError:
                 seen_hw = size_hw(image, turn)
                 # At an eighth of its size a JPEG is decoded in a third of the time, and the same damage is found.
                 image.draft(None, (max(1, image.width // 8), max(1, image.height // 8)))
-                return _Look(seen_hw, is_blank(rgb_pixels(image, file)), several, exif_damaged=turn is None)
+                pixels = rgb_pixels(image, file)
+                return _Look(
+                    seen_hw, is_blank(pixels), several, exif_damaged=turn is None, cut_off=is_cut_off(image, pixels)
+                )
         white = white_value(values, file)
     except UnreadableImageError as bad:
         return bad

@@ -19,7 +19,7 @@ from freegeo.data.procedural import get_domain
 from freegeo.errors import FreeGeoError, UserError
 from freegeo.files import as_json, read_json, write_json, write_tensors
 from freegeo.host import gigabytes, host_available
-from freegeo.lock import locked
+from freegeo.lock import locked, require_no_link
 from freegeo.models.da3 import Backbone
 from freegeo.training.batches import Batch, draw_batch
 from freegeo.training.config import TrainConfig
@@ -263,6 +263,7 @@ class Trainer:
         """Append one line to the run's log."""
         state = self.state
         counters = {"step": state.step, "views": state.seen, "s": round(state.seconds, 1)}
+        require_no_link(self.folder / LOG)
         with (self.folder / LOG).open("a", encoding="utf-8") as file:
             file.write(json.dumps({"kind": kind, **counters, **values}) + "\n")
 

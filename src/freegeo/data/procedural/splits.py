@@ -22,7 +22,7 @@ from freegeo.data.procedural.domains import DOMAINS, get_domain
 from freegeo.data.procedural.photographs import photograph_room
 from freegeo.data.scene import Scene, SceneTruth
 from freegeo.errors import DamagedError, UserError
-from freegeo.files import Kind, atomic_path, read_npz, write_npz
+from freegeo.files import Kind, atomic_path, read_npz, shared_folder, write_npz
 from freegeo.geometry.depth import depth_to_world, valid_depth
 
 PREFIX = "procedural-"
@@ -100,9 +100,11 @@ def _render(seed: int, domain: str, images: Path, points: Path) -> None:
     room = photograph_room(seed, domain, frames=FRAMES)
     assert room.T_cam_world is not None and room.K is not None and room.depth_z is not None
     arrays = {"T_cam_world": room.T_cam_world, "K": room.K, "depth_z": room.depth_z}
-    write_points(points, surface_points(room.depth_z, room.K, room.T_cam_world))
+    seen = surface_points(room.depth_z, room.K, room.T_cam_world)
     photos = np.stack([photo.read() for photo in room.photos])
-    write_npz(images, {"photos": photos, **{name: value.float().numpy() for name, value in arrays.items()}})
+    with shared_folder(images.parent):
+        write_points(points, seen)
+        write_npz(images, {"photos": photos, **{name: value.float().numpy() for name, value in arrays.items()}})
 
 
 def surface_points(depth_z: torch.Tensor, K: torch.Tensor, T_cam_world: torch.Tensor) -> np.ndarray:
