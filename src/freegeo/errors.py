@@ -4,7 +4,7 @@ import re
 from typing import Any
 
 _LONGEST_REASON = 300
-_NO_NAME = re.compile(r"[^\s/\\]{300,}")
+_NO_NAME = re.compile(r"[^\s/\\,]{300,}")
 """A word that is longer than any part of a path: content of a file, not its name."""
 
 
@@ -17,8 +17,8 @@ def in_short(reason: object) -> str:
 class FreeGeoError(Exception):
     """The work failed for a reason we understand (exit code 1); endless words in the sentence are cut off."""
 
-    def __init__(self, sentence: str = "") -> None:
-        super().__init__(_NO_NAME.sub(lambda word: f"{word[0][:80]}...", sentence))
+    def __init__(self, sentence: object = "") -> None:
+        super().__init__(_NO_NAME.sub(lambda word: f"{word[0][:80]}...", str(sentence)))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Let an error pass from a worker to another process as it is, whatever its own arguments were."""

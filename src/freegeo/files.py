@@ -190,15 +190,18 @@ def remove_file(path: Path) -> None:
     note_removed(path)
 
 
-def make_way(path: Path) -> None:
+def make_way(path: Path, *, is_own: bool = False) -> None:
     """Remove a file that freegeo wrote before another process begins to write it, line by line, under its final name.
+
+    `is_own`: the file is known to be freegeo's; earlier versions did not enter such files in the ledger.
 
     UserError when somebody else put a file or a link there; other errors as `remove_file`.
     """
     _require_own(path, path.parent)
     if path.is_symlink() and not path.exists():
         raise UserError(f"{path}: is a symbolic link, and freegeo did not make it. Remove it.")
-    _require_not_foreign([path])
+    if not is_own:
+        _require_not_foreign([path])
     _enter_in_ledger([path])
     remove_file(path)
 

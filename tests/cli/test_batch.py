@@ -6,6 +6,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import fields, is_dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -21,10 +22,19 @@ from cli.conftest import QUICK
 from freegeo import pools
 from freegeo.cli import console
 from freegeo.cli.app import build
-from freegeo.cli.batch import RECORD_NAME, _in_worker, _Table, as_arguments, environments, stored_rows
+from freegeo.cli.batch import (
+    RECORD_NAME,
+    SETTINGS,
+    _in_worker,
+    _Table,
+    _Work,
+    as_arguments,
+    environments,
+    stored_rows,
+)
 from freegeo.cli.files import FileOptions, FilterOptions
 from freegeo.cli.options import ModelOptions, PhotoOptions, PlacingOptions, RecipeOptions
-from freegeo.cli.scenes import named_scenes
+from freegeo.cli.scenes import NamedScene, named_scenes
 from freegeo.errors import UserError
 from freegeo.files import read_json, write_json
 from freegeo.report.overview import SceneRow, write_overview
@@ -215,6 +225,24 @@ def test_no_scene_counts_as_done_before_the_page_shows_it(tmp_path, monkeypatch)
     monkeypatch.setattr("freegeo.report.overview.write_overview", lambda *_: seen.append(record.exists()))
     table.write()
     assert (seen, record.exists()) == ([False], True)
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_logs_that_no_ledger_lists_are_replaced_where_the_record_names_the_scene(tmp_path, monkeypatch, recorded):
+    """Earlier versions did not enter logs in the ledger."""
+    monkeypatch.setattr("freegeo.pools.outcomes", lambda *_, **__: iter(()))
+    monkeypatch.setattr(_Table, "_pool", lambda *_, **__: nullcontext())
+    log, scene = tmp_path / "room.log", NamedScene(name="room", sources=("room",))
+    work = _Work(
+        scene=scene, arguments=(), overwrite=False, log=log, asked="", state=tmp_path / "room" / "state", before=None
+    )
+    with run_folder(tmp_path, SETTINGS):
+        if recorded:
+            write_json(tmp_path / RECORD_NAME, {"scenes": [{"name": "room", "outcome": "unfinished"}]})
+        log.write_text("before")
+        with nullcontext() if recorded else pytest.raises(UserError, match="did not write"):
+            _Table(tmp_path, [work]).carry_out(None, jobs=1, cluster=False)
+    assert log.exists() is not recorded
 
 
 @pytest.mark.parametrize(("seconds", "shown"), [(math.inf, "inf"), (math.nan, "nan"), (12.4, "12")])

@@ -418,7 +418,7 @@ def test_all_photos_that_cannot_be_used_are_named_at_once(tmp_path, encoded, cap
     assert "5 of 8 photos cannot be used and are left out: " in caplog.text
 
 
-@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+@pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("share", [0.4, 0.9, 1])
 def test_a_jpeg_that_was_cut_off_and_closed_is_doubted(tmp_path, caplog, share, orientation):
     """It has the mark of its end, so that no decoder finds fault with it."""
@@ -430,6 +430,14 @@ def test_a_jpeg_that_was_cut_off_and_closed_is_doubted(tmp_path, caplog, share, 
     (tmp_path / "a.jpg").write_bytes(data[: int(len(data) * share)] + b"\xff\xd9")
     load_photos(tmp_path)
     assert ("end in plain grey, as a JPEG does that was cut off: a.jpg" in caplog.text) == (share < 1)
+
+
+def test_a_grey_border_at_the_side_is_no_end(tmp_path, caplog):
+    noise = np.random.default_rng(0).integers(0, 256, (160, 96, 3), dtype=np.uint8)
+    noise[:, -32:] = noise[:, :32] = noise[:32] = 128
+    Image.fromarray(noise).save(tmp_path / "a.jpg", quality=100)
+    load_photos(tmp_path)
+    assert "end in plain grey" not in caplog.text
 
 
 def test_one_bad_photo_among_others(tmp_path, encoded, caplog):

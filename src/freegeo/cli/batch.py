@@ -253,6 +253,8 @@ class _Table:
 
         self.out, self.works = out, works
         self.rows = stored_rows(out / RECORD_NAME)
+        self.recorded = set(self.rows)
+        """Scenes of an earlier call, which made their logs."""
         self.skipped = {work.scene.name for work in works if self._is_done(work)}
         self.waiting = [work for work in works if work.scene.name not in self.skipped]
         self.begun: set[str] = set()
@@ -270,7 +272,7 @@ class _Table:
             return
         with self._pool(device, jobs=jobs, cluster=cluster) as pool:
             for work in self.waiting:
-                make_way(work.log)
+                make_way(work.log, is_own=work.scene.name in self.recorded)
             self.write()
             started = time.monotonic()
             for work, outcome in outcomes(pool, self.waiting, on_wait=self._say_begun):

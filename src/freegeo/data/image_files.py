@@ -371,13 +371,13 @@ def _turned(pixels: np.ndarray, orientation: int | None) -> np.ndarray:
     return np.array(upright(pixels), order="C")
 
 
-def is_cut_off(image: PillowImage, pixels: np.ndarray) -> bool:
-    """Whether the pixels (H, W, 3) of a decoded JPEG end in the very grey that decoders put in the place of lost data.
+def is_cut_off(image: PillowImage, pixels: np.ndarray, turn: int) -> bool:
+    """Whether a decoded JPEG ends in the very grey that decoders put in the place of lost data.
 
-    They may have been turned since.
+    `pixels` (H, W, 3) are upright; `turn` is the orientation that they had in the file. What is all grey has no end.
     """
-    edges = (pixels[-1], pixels[0], pixels[:, -1], pixels[:, 0])
-    return image.format in _JPEGS and any((edge == 128).all() for edge in edges)
+    last = {3: pixels[0], 4: pixels[0], 5: pixels[:, -1], 8: pixels[:, -1], 6: pixels[:, 0], 7: pixels[:, 0]}
+    return image.format in _JPEGS and not is_blank(pixels) and bool((last.get(turn, pixels[-1]) == 128).all())
 
 
 def is_blank(pixels: np.ndarray) -> bool:

@@ -469,9 +469,8 @@ def _look(file: Path) -> _Look | UnreadableImageError:
                 # At an eighth of its size a JPEG is decoded in a third of the time, and the same damage is found.
                 image.draft(None, (max(1, image.width // 8), max(1, image.height // 8)))
                 pixels = rgb_pixels(image, file)
-                return _Look(
-                    seen_hw, is_blank(pixels), several, exif_damaged=turn is None, cut_off=is_cut_off(image, pixels)
-                )
+                cut_off = is_cut_off(image, pixels, turn or 1)
+                return _Look(seen_hw, is_blank(pixels), several, exif_damaged=turn is None, cut_off=cut_off)
         white = white_value(values, file)
     except UnreadableImageError as bad:
         return bad

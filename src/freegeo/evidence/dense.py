@@ -233,8 +233,11 @@ def _cameras(candidate: Candidate) -> tuple[Tensor, Tensor]:
 
 
 def _slope(depth_z: Tensor) -> Tensor:
-    """Relative slope (S, H W) of depth maps (S, H, W), 0 where it is not known."""
-    return relative_slope(torch.where(valid_depth(depth_z), depth_z, torch.nan)).flatten(1)
+    """Relative slope (S, H W) of depth maps (S, H, W), 0 where it is not known; view by view, as it takes much room."""
+    slope = torch.empty_like(depth_z)
+    for view, depth in enumerate(depth_z):
+        slope[view] = relative_slope(torch.where(valid_depth(depth), depth, torch.nan))
+    return slope.flatten(1)
 
 
 def _tolerance(candidate: Candidate, known: Tensor, grid: Tensor) -> float:
