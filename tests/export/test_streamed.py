@@ -199,8 +199,9 @@ def test_memory_of_filters_and_exports_grows_by_the_file_and_masks_alone(tmp_pat
         peaks.append(1000 * int(done.stdout.split()[-1]))
         sizes.append(file.stat().st_size)
     pixels = (400 - 20) * 96 * 128
-    # Pages of the mapped file count as this process's memory, though the system may drop them; six masks, and slack.
-    assert peaks[1] - peaks[0] < sizes[1] - sizes[0] + 6 * pixels + 20_000_000
+    # Pages of the mapped file count as this process's memory, though the system may drop them; six masks; and what the
+    # allocator keeps, 20 to 21 MB by machine. One more copy of the depth would be 19 MB.
+    assert peaks[1] - peaks[0] < sizes[1] - sizes[0] + 6 * pixels + 28_000_000
 
 
 @dataclass(frozen=True)
